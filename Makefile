@@ -1,0 +1,84 @@
+# tss: `make deps demo` for a first picture, `make deps test` for the tests; `make help` for the rest.
+
+CC      ?= cc
+CFLAGS  ?= -O3 -march=native -g
+STD     := -std=c11
+WARN    := -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wsign-conversion
+BUILD   := build
+OUT     := out
+HEADERS := $(wildcard *.h)
+VIEWERS := $(wildcard examples/*.h)
+# OMP_NUM_THREADS or `--threads N` choose the threads; no result depends on them.
+
+# Serial OpenBLAS where a system has it: the library calls BLAS from several threads at once, and a
+# threaded BLAS would change bits with its thread count.
+SERIAL_BLAS := $(firstword $(wildcard /usr/lib/*/openblas-serial /usr/lib64/openblas-serial))
+BREW        := $(shell command -v brew >/dev/null 2>&1 && brew --prefix)
+ifneq ($(SERIAL_BLAS),)
+BLAS := -L$(SERIAL_BLAS) -Wl,-rpath,$(SERIAL_BLAS) -lopenblas
+else
+BLAS := $(if $(BREW),-L$(BREW)/opt/openblas/lib -I$(BREW)/opt/openblas/include) -lopenblas
+endif
+OPENMP := -fopenmp
+LIBS   := $(BLAS) -lmetis -lm
+ALL    := $(STD) $(CFLAGS) $(WARN) $(OPENMP) -I. -Iexamples -Itests $(DEFS)
+NOPKG  := -DTSS_NO_OPENMP -DTSS_NO_LAPACK -DTSS_NO_METIS
+
+.PHONY: help all deps demo test examples run-examples bench sanitize fuzz nodeps compat clean
+
+all: examples
+
+help:
+	@grep -E '^#: ' Makefile | sed 's/^#: //'
+
+#: deps          install what is missing (apt, dnf or brew); nothing to do the second time
+deps:
+	@sh tests/deps.sh
+
+#: demo          run the main scene: out/demo/report.html, stats.csv, frames/*.png
+demo: $(BUILD)/tss
+	$(BUILD)/tss run examples/scenes/demo.json -o $(OUT)/demo --frames png
+	@echo "open $(OUT)/demo/report.html"
+
+#: examples      build every example
+examples: $(BUILD)/01_hello $(BUILD)/tss
+
+#: run-examples  run them and check the number each is known by
+run-examples: examples
+	@sh tests/run_examples.sh $(BUILD)
+
+$(BUILD)/%: examples/%.c $(HEADERS) $(VIEWERS) tests/checker.h
+	@mkdir -p $(BUILD)
+	$(CC) $(ALL) $< -o $@ $(if $(filter tss,$*),-lcjson -lpng) $(LIBS)
+
+$(BUILD)/test_%: tests/test_%.c $(HEADERS) $(VIEWERS) $(wildcard tests/*.h)
+	@mkdir -p $(BUILD)
+	$(CC) $(ALL) $< -o $@ -lcmocka -lcjson -lpng $(LIBS) -lpthread
+
+$(BUILD)/contact_reference $(BUILD)/ccd_queries: $(BUILD)/%: tests/%.c $(HEADERS)
+	@mkdir -p $(BUILD)
+	$(CC) $(ALL) $< -o $@ $(LIBS)
+
+$(BUILD)/bench_%: bench/bench_%.c $(HEADERS)
+	@mkdir -p $(BUILD)
+	$(CC) $(ALL) $< -o $@ $(LIBS)
+
+TESTS := $(patsubst tests/%.c,$(BUILD)/%,$(wildcard tests/test_*.c))
+
+#: test          every test in every configuration; ends with `N passed, N failed`
+test: $(TESTS) $(BUILD)/contact_reference $(BUILD)/ccd_queries examples
+	@sh tests/run.sh $(BUILD)
+
+#: sanitize      the tests under ASan+UBSan, and under TSan with a pthread pool
+#: nodeps        the tests with each TSS_NO_* alone and with all of them
+#: compat        gcc, clang, g++, two translation units, the headers alone
+#: fuzz          60 s for each fuzz target (clang)
+sanitize nodeps compat fuzz:
+	@sh tests/run.sh $(BUILD) $@
+
+#: bench         speed against peers and reference figures → out/bench/*.csv (minutes)
+bench:
+	@sh bench/run.sh $(BUILD) $(OUT)/bench
+
+clean:
+	rm -rf $(BUILD) $(OUT)
