@@ -647,6 +647,8 @@ TSS_API tss_result tss_world_step(tss_world *w, tss_step_info *info);
 // The same, but returns after about `seconds` (host.clock is needed) with the best state so far.
 TSS_API tss_result tss_world_step_for(tss_world *w, double seconds, tss_step_info *info);
 
+// The host as the world uses it: memory taken through it is counted in info.bytes.
+TSS_API const tss_host *tss_world_host(const tss_world *w);
 TSS_API int tss_world_dim(const tss_world *w);
 TSS_API int tss_world_nodes(const tss_world *w);
 TSS_API double tss_world_time(const tss_world *w);
@@ -2521,8 +2523,9 @@ static tss_energy_def tss__elastic_def(tss__elastic *e) {
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss__damping {
-    const tss__elastic *e;  // not owned; outlives this
-    tss__stretch *frozen;   // e->blocks: U, V, S, A, B with the volume in
+    tss__elastic *e;        // not owned; outlives all calls but destroy
+    int blocks;
+    tss__stretch *frozen;   // blocks: U, V, S, A, B with the volume in
 } tss__damping;
 
 #define TSS__STRETCH_LANES (int)(sizeof(tss__stretch) / sizeof(tss__lanes))
@@ -2690,30 +2693,30 @@ static void tss__damping_hessian(void *user, const tss_ctx *c, const double *x, 
 
 static tss_result tss__damping_lists(void *user, const tss_ctx *c, const double *x,
                                      const double *d, double t_max, tss_stencils *out) {
-    tss__damping *m = (tss__damping *)user;
-    return tss__elastic_lists((void *)(uintptr_t)m->e, c, x, d, t_max, out);
+    const tss__elastic *e = ((const tss__damping *)user)->e;
+    (void)c, (void)x, (void)d, (void)t_max;
+    out->count = e->cells, out->node = e->node, out->pattern = 1;
+    return TSS_OK;
 }
 
 static void tss__damping_describe(void *user, const tss_ctx *c, int id, char *text, size_t size) {
-    tss__damping *m = (tss__damping *)user;
-    tss__elastic_describe((void *)(uintptr_t)m->e, c, id, text, size);
+    tss__elastic_describe(((tss__damping *)user)->e, c, id, text, size);
 }
 
 static void tss__damping_destroy(void *user, const tss_host *host) {
     tss__damping *m = (tss__damping *)user;
     if (!m) return;
-    tss_free(host, m->frozen, (size_t)m->e->blocks * sizeof *m->frozen);
+    tss_free(host, m->frozen, (size_t)m->blocks * sizeof *m->frozen);
     tss_free(host, m, sizeof *m);
 }
 
 // Damping of e (material.damping > 0, not custom), which it reads and which must outlive it.
-static tss_result tss__damping_create(const tss_host *host, const tss__elastic *e,
-                                      tss_energy_def *out) {
+static tss_result tss__damping_create(const tss_host *host, tss__elastic *e, tss_energy_def *out) {
     if (!(e->material.damping >= 0) || e->material.kind == TSS_CUSTOM_MATERIAL)
         return TSS_ERROR_BAD_MATERIAL;
     tss__damping *m = (tss__damping *)tss_alloc(host, sizeof *m);
     if (!m) return TSS_ERROR_NO_MEMORY;
-    m->e = e;
+    m->e = e, m->blocks = e->blocks;
     m->frozen = (tss__stretch *)tss_alloc(host, (size_t)e->blocks * sizeof *m->frozen);
     if (!m->frozen) {
         tss_free(host, m, sizeof *m);
@@ -2732,6 +2735,687 @@ static tss_result tss__damping_create(const tss_host *host, const tss__elastic *
     out->begin_step = tss__damping_begin;
     out->describe = tss__damping_describe;
     out->destroy = tss__damping_destroy;
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>membranes (private)
+// Triangles in 3D, eight at a time. F = [x_1 − x_0, x_2 − x_0] Dm⁻¹ is 3 × 2; strain
+// delta = FᵀF − I. P = F S with S = mu delta + lambda/2 tr I (StVK), or
+// S = C⁻¹ (mu delta + lambda ln J I) (Neo-Hookean). For the Hessian F gets a third column of zeros:
+// its SVD gives U with the normal as third column, and the frame of >>stretch_hessian holds with a
+// 2 × 2 stretch block, one flip and twist pair, and for dF out of the plane psi_a/sigma_a.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__membrane {
+    int triangles, blocks;
+    tss_material_kind kind;
+    double mu, lambda;  // lambda of plane stress
+    int *node;          // triangles × 3
+    tss__lanes *inv;    // blocks × 4
+    tss__lanes *weight; // blocks: area × thickness
+} tss__membrane;
+
+typedef struct tss__sheet {
+    TSS__ALIGN tss__lanes F[6];  // 3 × 2
+    TSS__ALIGN tss__lanes inv[4];
+    TSS__ALIGN tss__lanes weight, tr, det, delta2, J2;
+    TSS__ALIGN tss__lanes delta[3];  // xx yy xy; det = det delta, J2 = det C
+    int used;
+} tss__sheet;
+
+static void tss__sheet_load(const tss__membrane *m, const double *x, const tss_ids *ids, int at,
+                            tss__sheet *s) {
+    TSS__ALIGN tss__lanes D[6];
+    s->used = ids->count - at < TSS_LANES ? ids->count - at : TSS_LANES;
+    for (int l = 0; l < TSS_LANES; l++) {
+        const int k = at + (l < s->used ? l : s->used - 1), id = ids->list ? ids->list[k] : ids->first + k;
+        const int *n = m->node + (size_t)id * 3, b = id / TSS_LANES, lane = id % TSS_LANES;
+        for (int e = 0; e < 2; e++)
+            for (int r = 0; r < 3; r++)
+                D[r * 2 + e][l] = x[(size_t)n[e + 1] * 3 + (size_t)r] - x[(size_t)n[0] * 3 + (size_t)r];
+        for (int i = 0; i < 4; i++) s->inv[i][l] = m->inv[(size_t)b * 4 + (size_t)i][lane];
+        s->weight[l] = m->weight[b][lane];
+    }
+    for (int r = 0; r < 3; r++)
+        TSS__EACH_LANE(l) {
+            double a = D[r * 2][l], b = D[r * 2 + 1][l];
+            s->F[r * 2][l] = a * s->inv[0][l] + b * s->inv[2][l];
+            s->F[r * 2 + 1][l] = a * s->inv[1][l] + b * s->inv[3][l];
+        }
+}
+
+static void tss__sheet_strain(tss__sheet *s) {
+    TSS__EACH_LANE(l) {
+        double a = s->F[0][l], b = s->F[1][l], c = s->F[2][l], d = s->F[3][l];
+        double e = s->F[4][l], f = s->F[5][l];
+        double xx = a * a + c * c + e * e - 1, yy = b * b + d * d + f * f - 1, xy = a * b + c * d + e * f;
+        // det C as the squared area: no cancellation where the triangle is thin.
+        double nx = c * f - e * d, ny = e * b - a * f, nz = a * d - c * b;
+        s->delta[0][l] = xx, s->delta[1][l] = yy, s->delta[2][l] = xy;
+        s->tr[l] = xx + yy, s->det[l] = xx * yy - xy * xy;
+        s->delta2[l] = xx * xx + yy * yy + 2 * (xy * xy);
+        s->J2[l] = nx * nx + ny * ny + nz * nz;
+    }
+}
+
+// ln det C = 2 ln J and tr − ln det C, as tss__log_J2 but from J².
+TSS__INLINE double tss__log_det_C(double tr, double det, double delta2, double J2, double *gap) {
+    double k, f, e = tr + det;
+    int small = delta2 <= TSS__SMALL_STRAIN;
+    tss__split(J2, &k, &f);
+    k = small ? 0.0 : k;
+    f = small ? e : f;
+    double tail = tss__log_tail(f), y = tss__log_join(k, f, tail);
+    *gap = small ? tail - det : tr - y;
+    return y;
+}
+
+static void tss__membrane_value(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                double *out) {
+    const tss__membrane *m = (const tss__membrane *)user;
+    const double mu = m->mu, lambda = m->lambda;
+    (void)c;
+    for (int at = 0; at < ids.count; at += TSS_LANES) {
+        tss__sheet s;
+        TSS__ALIGN tss__lanes v;
+        tss__sheet_load(m, x, &ids, at, &s);
+        tss__sheet_strain(&s);
+        if (m->kind == TSS_STVK)
+            TSS__EACH_LANE(l) v[l] = 0.25 * mu * s.delta2[l] + 0.125 * lambda * (s.tr[l] * s.tr[l]);
+        else
+            TSS__EACH_LANE(l) {
+                double gap, y = tss__log_det_C(s.tr[l], s.det[l], s.delta2[l], s.J2[l], &gap);
+                double psi = 0.5 * mu * gap + 0.125 * lambda * (y * y);
+                v[l] = s.J2[l] > 0 ? psi : HUGE_VAL;
+            }
+        for (int l = 0; l < s.used; l++) out[at + l] = s.weight[l] * v[l];
+    }
+}
+
+// The symmetric factor S of P = F S, xx yy xy.
+static void tss__sheet_stress(const tss__membrane *m, tss__sheet *s, tss__lanes *S) {
+    const double mu = m->mu, lambda = m->lambda;
+    if (m->kind == TSS_STVK) {
+        TSS__EACH_LANE(l) {
+            double t = 0.5 * lambda * s->tr[l];
+            S[0][l] = mu * s->delta[0][l] + t, S[1][l] = mu * s->delta[1][l] + t;
+            S[2][l] = mu * s->delta[2][l];
+        }
+        return;
+    }
+    TSS__EACH_LANE(l) {
+        double gap, y = tss__log_det_C(s->tr[l], s->det[l], s->delta2[l], s->J2[l], &gap);
+        double xx = s->delta[0][l], yy = s->delta[1][l], xy = s->delta[2][l];
+        // adj(C) (mu delta + t I)/det C; adj(C) delta = adj(I + delta) delta = delta + det delta I.
+        double i = 1 / s->J2[l], a = mu * i, t = 0.5 * lambda * y * i;
+        S[0][l] = a * (xx + s->det[l]) + t * (1 + yy);
+        S[1][l] = a * (yy + s->det[l]) + t * (1 + xx);
+        S[2][l] = (a - t) * xy;
+    }
+}
+
+static void tss__membrane_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                   double *out) {
+    const tss__membrane *m = (const tss__membrane *)user;
+    (void)c;
+    for (int at = 0; at < ids.count; at += TSS_LANES) {
+        tss__sheet s;
+        TSS__ALIGN tss__lanes S[3];
+        TSS__ALIGN tss__lanes G[9];
+        tss__sheet_load(m, x, &ids, at, &s);
+        tss__sheet_strain(&s);
+        tss__sheet_stress(m, &s, S);
+        for (int r = 0; r < 3; r++)
+            TSS__EACH_LANE(l) {
+                double a = s.F[r * 2][l], b = s.F[r * 2 + 1][l], w = s.weight[l];
+                double p = w * (a * S[0][l] + b * S[2][l]), q = w * (a * S[2][l] + b * S[1][l]);
+                double g1 = p * s.inv[0][l] + q * s.inv[1][l];
+                double g2 = p * s.inv[2][l] + q * s.inv[3][l];
+                G[r][l] = -(g1 + g2), G[3 + r][l] = g1, G[6 + r][l] = g2;
+            }
+        tss__tile_scatter(9, s.used, G, out + at * 9);
+    }
+}
+
+// Eigenvalues in the frame; the pairs (a, normal) as flip = twist = psi_a/sigma_a.
+static void tss__sheet_stretch(const tss__membrane *m, tss__stretch *h) {
+    const double mu = m->mu, lambda = m->lambda;
+    const int stvk = m->kind == TSS_STVK;
+    TSS__EACH_LANE(l) {
+        double a = h->sigma[0][l], b = h->sigma[1][l], a2 = a * a, b2 = b * b, ab = a * b;
+        double half = 0.5 * lambda * (a2 + b2 - 2), c = mu - lambda * tss__log(ab), i = 1 / ab;
+        double ia = 1 / a2, ib = 1 / b2;
+        h->S[0][l] = stvk ? mu * (3 * a2 - 1) + half + lambda * a2 : mu + (c + lambda) * ia;
+        h->S[1][l] = stvk ? mu * (3 * b2 - 1) + half + lambda * b2 : mu + (c + lambda) * ib;
+        h->S[5][l] = stvk ? lambda * ab : lambda * i;
+        h->flip[2][l] = stvk ? mu * (a2 + ab + b2 - 1) + half : mu + c * i;
+        h->twist[2][l] = stvk ? mu * (a2 - ab + b2 - 1) + half : mu - c * i;
+        double na = stvk ? mu * (a2 - 1) + half : mu - c * ia;
+        double nb = stvk ? mu * (b2 - 1) + half : mu - c * ib;
+        h->flip[1][l] = na, h->twist[1][l] = na;
+        h->flip[0][l] = nb, h->twist[0][l] = nb;
+    }
+}
+
+static void tss__membrane_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                  int psd, double *out) {
+    const tss__membrane *m = (const tss__membrane *)user;
+    (void)c;
+    for (int at = 0; at < ids.count; at += TSS_LANES) {
+        tss__sheet s;
+        TSS__ALIGN tss__lanes F[9];
+        TSS__ALIGN tss__lanes b[6];
+        TSS__ALIGN tss__lanes W[81];
+        TSS__ALIGN tss__stretch h;
+        tss__sheet_load(m, x, &ids, at, &s);
+        for (int r = 0; r < 3; r++)
+            TSS__EACH_LANE(l)
+                F[r * 3][l] = s.F[r * 2][l], F[r * 3 + 1][l] = s.F[r * 2 + 1][l], F[r * 3 + 2][l] = 0;
+        tss__svd(3, F, h.U, h.sigma, h.V);
+        tss__sheet_stretch(m, &h);
+        tss__stretch_finish(2, psd, s.weight, &h);
+        for (int k = 0; k < 2; k++)
+            TSS__EACH_LANE(l) {
+                double p = s.inv[k * 2][l], q = s.inv[k * 2 + 1][l];
+                b[k * 3][l] = p * h.V[0][l] + q * h.V[3][l];
+                b[k * 3 + 1][l] = p * h.V[1][l] + q * h.V[4][l];
+                b[k * 3 + 2][l] = 0;
+            }
+        tss__assemble(3, 2, b, &h, W);
+        tss__tile_scatter_sym(9, s.used, W, out + (size_t)at * 81);
+    }
+}
+
+static tss_result tss__membrane_lists(void *user, const tss_ctx *c, const double *x,
+                                      const double *d, double t_max, tss_stencils *out) {
+    const tss__membrane *m = (const tss__membrane *)user;
+    (void)c, (void)x, (void)d, (void)t_max;
+    out->count = m->triangles, out->node = m->node, out->pattern = 1;
+    return TSS_OK;
+}
+
+static void tss__membrane_describe(void *user, const tss_ctx *c, int id, char *text, size_t size) {
+    const int *n = ((const tss__membrane *)user)->node + (size_t)id * 3;
+    (void)c;
+    snprintf(text, size, "membrane triangle %d (nodes %d %d %d)", id, n[0], n[1], n[2]);
+}
+
+static void tss__membrane_destroy(void *user, const tss_host *host) {
+    tss__membrane *m = (tss__membrane *)user;
+    if (!m) return;
+    tss_free(host, m->node, (size_t)m->triangles * 3 * sizeof *m->node);
+    tss_free(host, m->inv, (size_t)m->blocks * 4 * sizeof *m->inv);
+    tss_free(host, m->weight, (size_t)m->blocks * sizeof *m->weight);
+    tss_free(host, m, sizeof *m);
+}
+
+// Rest triangle in its own plane: Dm = [|a|, a·b/|a|; 0, |a × b|/|a|]. 0 if it has no area.
+static int tss__membrane_rest(tss__membrane *m, int slot, const double *X, double thickness) {
+    const int t = slot < m->triangles ? slot : m->triangles - 1, *n = m->node + (size_t)t * 3;
+    const size_t b = (size_t)(slot / TSS_LANES), l = (size_t)(slot % TSS_LANES);
+    const double *p = X + (size_t)n[0] * 3, *q = X + (size_t)n[1] * 3, *r = X + (size_t)n[2] * 3;
+    const double u[3] = {q[0] - p[0], q[1] - p[1], q[2] - p[2]};
+    const double v[3] = {r[0] - p[0], r[1] - p[1], r[2] - p[2]};
+    const double x = u[1] * v[2] - u[2] * v[1], y = u[2] * v[0] - u[0] * v[2];
+    const double z = u[0] * v[1] - u[1] * v[0], area2 = sqrt(x * x + y * y + z * z);
+    const double length = sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]);
+    const double along = (u[0] * v[0] + u[1] * v[1] + u[2] * v[2]) / length, high = area2 / length;
+    if (!(area2 > 0) || !(high > 0) || !(area2 <= 1e300)) return 0;
+    m->inv[b * 4][l] = 1 / length, m->inv[b * 4 + 1][l] = -along / (length * high);
+    m->inv[b * 4 + 2][l] = 0, m->inv[b * 4 + 3][l] = 1 / high;
+    m->weight[b][l] = 0.5 * area2 * thickness;
+    return 1;
+}
+
+static int tss__nodes_ok(const int *node, size_t count) {
+    if (!node) return 0;
+    for (size_t i = 0; i < count; i++)
+        if (node[i] < 0) return 0;
+    return 1;
+}
+
+tss_membrane_def tss_membrane_def_default(void) {
+    tss_membrane_def d;
+    memset(&d, 0, sizeof d);
+    d.thickness = 1e-3;
+    d.material = tss_material_default();
+    return d;
+}
+
+static tss__membrane *tss__membrane_alloc(const tss_host *host, const tss_membrane_def *def) {
+    tss__membrane *m = (tss__membrane *)tss_alloc(host, sizeof *m);
+    if (!m) return NULL;
+    memset(m, 0, sizeof *m);
+    m->triangles = def->triangles, m->blocks = (def->triangles - 1) / TSS_LANES + 1;
+    m->node = (int *)tss_alloc(host, (size_t)m->triangles * 3 * sizeof *m->node);
+    m->inv = (tss__lanes *)tss_alloc(host, (size_t)m->blocks * 4 * sizeof *m->inv);
+    m->weight = (tss__lanes *)tss_alloc(host, (size_t)m->blocks * sizeof *m->weight);
+    if (m->node && m->inv && m->weight) return m;
+    tss__membrane_destroy(m, host);
+    return NULL;
+}
+
+// An energy of forces: times αh², the pattern fixed.
+static tss_energy_def tss__thin_energy(const char *name, int arity, void *user) {
+    tss_energy_def d;
+    memset(&d, 0, sizeof d);
+    d.name = name, d.arity = arity, d.user = user, d.flags = TSS_ENERGY_TIMES_AH2;
+    return d;
+}
+
+tss_result tss_membrane_energy(const tss_host *host, const tss_membrane_def *def,
+                               tss_energy_def *out) {
+    if (!def || !out || !host || def->triangles < 1 || !def->X || !(def->thickness > 0) ||
+        !tss__nodes_ok(def->node, (size_t)def->triangles * 3))
+        return TSS_ERROR_BAD_ARGUMENT;
+    const tss_material *mat = &def->material;
+    if ((mat->kind != TSS_STVK && mat->kind != TSS_NEO_HOOKEAN) ||
+        !tss__material_ok(mat->E, mat->nu, mat->rho))
+        return TSS_ERROR_BAD_MATERIAL;
+    tss__membrane *m = tss__membrane_alloc(host, def);
+    if (!m) return TSS_ERROR_NO_MEMORY;
+    m->kind = mat->kind;
+    tss_lame(mat->E, mat->nu, &m->mu, NULL);
+    m->lambda = mat->E * mat->nu / (1 - mat->nu * mat->nu);
+    memcpy(m->node, def->node, (size_t)m->triangles * 3 * sizeof *m->node);
+    for (int s = 0; s < m->blocks * TSS_LANES; s++)
+        if (!tss__membrane_rest(m, s, def->X, def->thickness)) {
+            tss__membrane_destroy(m, host);
+            return TSS_ERROR_BAD_MESH;
+        }
+    *out = tss__thin_energy("membrane", 3, m);
+    out->lists = tss__membrane_lists;
+    out->value = tss__membrane_value;
+    out->gradient = tss__membrane_gradient;
+    out->hessian = tss__membrane_hessian;
+    out->describe = tss__membrane_describe;
+    out->destroy = tss__membrane_destroy;
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>hinges (private)
+// e = x_1 − x_0, a = x_2 − x_0, b = x_3 − x_0; normals m = e × a of (0, 1, 2), n = b × e of (1, 0, 3).
+// theta = atan2(−(m × n)·ê, m·n) with derivatives
+//     g_2 = |e| m/|m|²,  g_3 = |e| n/|n|²,  g_1 = −s_a g_2 − s_b g_3,  g_0 = −g_1 − g_2 − g_3,
+// s_a = a·e/|e|² the foot of x_2 on the edge; their derivatives give ∇²theta row by row. A triangle
+// without area has no normal: its terms are cut off (1e-290), the angle's gradient grows as 1/height.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__hinges {
+    int count;
+    int *node;             // count × 4
+    double *weight, *rest; // 3 k ‖e‖²/(A_1 + A_2); angle
+} tss__hinges;
+
+typedef struct tss__hinge {
+    double e[3], a[3], b[3], m[3], n[3];
+    double length, ee, mm, nn, sa, sb;  // |e|, squares, feet
+} tss__hinge;
+
+static void tss__cross(const double *a, const double *b, double *c) {
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+static double tss__dot(const double *a, const double *b) {
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static void tss__hinge_load(const int *node, const double *x, tss__hinge *h) {
+    const double *o = x + (size_t)node[0] * 3;
+    for (int r = 0; r < 3; r++) {
+        h->e[r] = x[(size_t)node[1] * 3 + (size_t)r] - o[r];
+        h->a[r] = x[(size_t)node[2] * 3 + (size_t)r] - o[r];
+        h->b[r] = x[(size_t)node[3] * 3 + (size_t)r] - o[r];
+    }
+    tss__cross(h->e, h->a, h->m);
+    tss__cross(h->b, h->e, h->n);
+    h->ee = tss__dot(h->e, h->e), h->mm = tss__dot(h->m, h->m), h->nn = tss__dot(h->n, h->n);
+    if (h->ee < 1e-290) h->ee = 1e-290;
+    if (h->mm < 1e-290) h->mm = 1e-290;
+    if (h->nn < 1e-290) h->nn = 1e-290;
+    h->length = sqrt(h->ee);
+    h->sa = tss__dot(h->a, h->e) / h->ee, h->sb = tss__dot(h->b, h->e) / h->ee;
+}
+
+static double tss__hinge_angle(const tss__hinge *h) {
+    double c[3];
+    tss__cross(h->m, h->n, c);
+    return atan2(-tss__dot(c, h->e) / h->length, tss__dot(h->m, h->n));
+}
+
+// theta − rest on the shorter way round.
+static double tss__hinge_bend(const tss__hinge *h, double rest) {
+    const double pi = 3.14159265358979323846, t = tss__hinge_angle(h) - rest;
+    return t > pi ? t - 2 * pi : t < -pi ? t + 2 * pi : t;
+}
+
+static void tss__hinge_gradient(const tss__hinge *h, double *g) {
+    for (int r = 0; r < 3; r++) {
+        const double p = h->length * h->m[r] / h->mm, q = h->length * h->n[r] / h->nn;
+        g[6 + r] = p, g[9 + r] = q;
+        g[3 + r] = -h->sa * p - h->sb * q;
+        g[r] = -(g[3 + r] + p + q);
+    }
+}
+
+// Derivative of g = |e| m/|m|² (m = e × a; 'sign' −1: m = a × e) by e and by a, 3 × 3 each:
+// m/|m|² ⊗ ê + |e|/|m|² (I − 2 m̂m̂ᵀ) ∂m.
+static void tss__wing_derivative(const tss__hinge *h, const double *a, const double *m, double mm,
+                                 double sign, double *by_e, double *by_a) {
+    for (int c = 0; c < 3; c++) {
+        double unit[3] = {0, 0, 0}, de[3], da[3];
+        unit[c] = sign;
+        tss__cross(unit, a, de);    // ∂m/∂e_c
+        tss__cross(h->e, unit, da); // ∂m/∂a_c
+        const double te = 2 * tss__dot(m, de) / mm, ta = 2 * tss__dot(m, da) / mm;
+        for (int r = 0; r < 3; r++) {
+            by_e[r * 3 + c] = (m[r] * h->e[c] / h->length + h->length * (de[r] - te * m[r])) / mm;
+            by_a[r * 3 + c] = h->length * (da[r] - ta * m[r]) / mm;
+        }
+    }
+}
+
+// Adds s·B to the block (i, j) of H, for derivatives by an edge vector x_j − x_0.
+static void tss__add_edge_block(double *H, int i, int j, double s, const double *B) {
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) {
+            H[(i * 3 + r) * 12 + j * 3 + c] += s * B[r * 3 + c];
+            H[(i * 3 + r) * 12 + c] -= s * B[r * 3 + c];
+        }
+}
+
+// Rows of ∇²theta that wing w (node 2 or 3) gives: those of g_w, and −s g_w in row 1.
+static void tss__wing_rows(const tss__hinge *h, int w, double *H) {
+    const double *a = w == 2 ? h->a : h->b, *m = w == 2 ? h->m : h->n;
+    const double mm = w == 2 ? h->mm : h->nn, s = w == 2 ? h->sa : h->sb;
+    double by_e[9], by_a[9], foot_e[9], foot_a[9];
+    tss__wing_derivative(h, a, m, mm, w == 2 ? 1 : -1, by_e, by_a);
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) {
+            const double g = h->length * m[r] / mm;
+            foot_e[r * 3 + c] = g * (a[c] - 2 * s * h->e[c]) / h->ee;
+            foot_a[r * 3 + c] = g * h->e[c] / h->ee;
+        }
+    tss__add_edge_block(H, w, 1, 1, by_e), tss__add_edge_block(H, w, w, 1, by_a);
+    tss__add_edge_block(H, 1, 1, -s, by_e), tss__add_edge_block(H, 1, w, -s, by_a);
+    tss__add_edge_block(H, 1, 1, -1, foot_e), tss__add_edge_block(H, 1, w, -1, foot_a);
+}
+
+static void tss__hinge_hessian(const tss__hinge *h, double *H) {
+    memset(H, 0, 144 * sizeof *H);
+    tss__wing_rows(h, 2, H);
+    tss__wing_rows(h, 3, H);
+    for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 12; c++)
+            H[r * 12 + c] = -(H[(3 + r) * 12 + c] + H[(6 + r) * 12 + c] + H[(9 + r) * 12 + c]);
+    for (int r = 0; r < 12; r++)
+        for (int c = 0; c < r; c++)
+            H[r * 12 + c] = H[c * 12 + r] = 0.5 * (H[r * 12 + c] + H[c * 12 + r]);
+}
+
+static void tss__hinges_value(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                              double *out) {
+    const tss__hinges *e = (const tss__hinges *)user;
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        const int id = ids.list ? ids.list[k] : ids.first + k;
+        tss__hinge h;
+        tss__hinge_load(e->node + (size_t)id * 4, x, &h);
+        const double t = tss__hinge_bend(&h, e->rest[id]);
+        out[k] = 0.5 * e->weight[id] * (t * t);
+    }
+}
+
+static void tss__hinges_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                 double *out) {
+    const tss__hinges *e = (const tss__hinges *)user;
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        const int id = ids.list ? ids.list[k] : ids.first + k;
+        tss__hinge h;
+        tss__hinge_load(e->node + (size_t)id * 4, x, &h);
+        const double f = e->weight[id] * tss__hinge_bend(&h, e->rest[id]);
+        tss__hinge_gradient(&h, out + k * 12);
+        for (int i = 0; i < 12; i++) out[k * 12 + i] *= f;
+    }
+}
+
+static void tss__hinges_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd,
+                                double *out) {
+    const tss__hinges *e = (const tss__hinges *)user;
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        const int id = ids.list ? ids.list[k] : ids.first + k;
+        double g[12], *H = out + (size_t)k * 144, bend = 0;
+        tss__hinge h;
+        tss__hinge_load(e->node + (size_t)id * 4, x, &h);
+        tss__hinge_gradient(&h, g);
+        if (psd) memset(H, 0, 144 * sizeof *H);
+        else tss__hinge_hessian(&h, H), bend = tss__hinge_bend(&h, e->rest[id]);
+        for (int r = 0; r < 12; r++)
+            for (int j = 0; j < 12; j++)
+                H[r * 12 + j] = e->weight[id] * (g[r] * g[j] + bend * H[r * 12 + j]);
+    }
+}
+
+static tss_result tss__hinges_lists(void *user, const tss_ctx *c, const double *x, const double *d,
+                                    double t_max, tss_stencils *out) {
+    const tss__hinges *e = (const tss__hinges *)user;
+    (void)c, (void)x, (void)d, (void)t_max;
+    out->count = e->count, out->node = e->node, out->pattern = 1;
+    return TSS_OK;
+}
+
+static void tss__hinges_describe(void *user, const tss_ctx *c, int id, char *text, size_t size) {
+    const int *n = ((const tss__hinges *)user)->node + (size_t)id * 4;
+    (void)c;
+    snprintf(text, size, "hinge %d (edge %d %d, wings %d %d)", id, n[0], n[1], n[2], n[3]);
+}
+
+static void tss__hinges_destroy(void *user, const tss_host *host) {
+    tss__hinges *e = (tss__hinges *)user;
+    if (!e) return;
+    tss_free(host, e->node, (size_t)e->count * 4 * sizeof *e->node);
+    tss_free(host, e->weight, (size_t)e->count * sizeof *e->weight);
+    tss_free(host, e->rest, (size_t)e->count * sizeof *e->rest);
+    tss_free(host, e, sizeof *e);
+}
+
+tss_hinge_def tss_hinge_def_default(void) {
+    tss_hinge_def d;
+    memset(&d, 0, sizeof d);
+    d.stiffness = 1e-4;
+    return d;
+}
+
+static tss__hinges *tss__hinges_alloc(const tss_host *host, int count) {
+    tss__hinges *e = (tss__hinges *)tss_alloc(host, sizeof *e);
+    if (!e) return NULL;
+    memset(e, 0, sizeof *e);
+    e->count = count;
+    e->node = (int *)tss_alloc(host, (size_t)count * 4 * sizeof *e->node);
+    e->weight = (double *)tss_alloc(host, (size_t)count * sizeof *e->weight);
+    e->rest = (double *)tss_alloc(host, (size_t)count * sizeof *e->rest);
+    if (e->node && e->weight && e->rest) return e;
+    tss__hinges_destroy(e, host);
+    return NULL;
+}
+
+tss_result tss_hinge_energy(const tss_host *host, const tss_hinge_def *def, tss_energy_def *out) {
+    if (!host || !def || !out || def->hinges < 1 || !def->X || !(def->stiffness > 0) ||
+        !tss__nodes_ok(def->node, (size_t)def->hinges * 4))
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__hinges *e = tss__hinges_alloc(host, def->hinges);
+    if (!e) return TSS_ERROR_NO_MEMORY;
+    memcpy(e->node, def->node, (size_t)def->hinges * 4 * sizeof *e->node);
+    for (int i = 0; i < def->hinges; i++) {
+        tss__hinge h;
+        tss__hinge_load(e->node + (size_t)i * 4, def->X, &h);
+        if (!(h.mm > 1e-290) || !(h.nn > 1e-290)) {
+            tss__hinges_destroy(e, host);
+            return TSS_ERROR_BAD_MESH;
+        }
+        e->weight[i] = 6 * def->stiffness * h.ee / (sqrt(h.mm) + sqrt(h.nn));
+        e->rest[i] = def->rest_angle ? def->rest_angle[i] : tss__hinge_angle(&h);
+    }
+    *out = tss__thin_energy("hinges", 4, e);
+    out->lists = tss__hinges_lists;
+    out->value = tss__hinges_value;
+    out->gradient = tss__hinges_gradient;
+    out->hessian = tss__hinges_hessian;
+    out->describe = tss__hinges_describe;
+    out->destroy = tss__hinges_destroy;
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>springs (private)
+// With u = (x_b − x_a)/l: gradient k (l − L) u, Hessian k (uuᵀ + (1 − L/l)(I − uuᵀ)); the second
+// factor is what the projection clamps. At l = 0 the direction is lost: no force then.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__springs {
+    int count, dim;
+    int *node;       // count × 2
+    double *k, *rest;
+} tss__springs;
+
+// Unit direction and length.
+static double tss__spring_load(const tss__springs *e, int id, const double *x, double *u) {
+    const size_t d = (size_t)e->dim;
+    const double *p = x + (size_t)e->node[2 * id] * d, *q = x + (size_t)e->node[2 * id + 1] * d;
+    u[2] = 0;
+    for (size_t r = 0; r < d; r++) u[r] = q[r] - p[r];
+    const double l = sqrt(tss__dot(u, u));
+    for (size_t r = 0; r < d; r++) u[r] = l > 0 ? u[r] / l : 0;
+    return l;
+}
+
+static void tss__springs_value(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                               double *out) {
+    const tss__springs *e = (const tss__springs *)user;
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        const int id = ids.list ? ids.list[k] : ids.first + k;
+        double u[3];
+        const double s = tss__spring_load(e, id, x, u) - e->rest[id];
+        out[k] = 0.5 * e->k[id] * (s * s);
+    }
+}
+
+static void tss__springs_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                  double *out) {
+    const tss__springs *e = (const tss__springs *)user;
+    const int d = e->dim;
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        const int id = ids.list ? ids.list[k] : ids.first + k;
+        double u[3], *g = out + k * 2 * d;
+        const double f = e->k[id] * (tss__spring_load(e, id, x, u) - e->rest[id]);
+        for (int r = 0; r < d; r++) g[r] = -f * u[r], g[d + r] = f * u[r];
+    }
+}
+
+static void tss__springs_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd,
+                                 double *out) {
+    const tss__springs *e = (const tss__springs *)user;
+    const int d = e->dim, n = 2 * d;
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        const int id = ids.list ? ids.list[k] : ids.first + k;
+        double u[3], *H = out + k * n * n;
+        const double l = tss__spring_load(e, id, x, u), L = e->rest[id];
+        double across = L > 0 ? 1 - L / (l > 1e-290 ? l : 1e-290) : 1;
+        if (psd && across < 0) across = 0;
+        for (int r = 0; r < d; r++)
+            for (int j = 0; j < d; j++) {
+                const double v = e->k[id] * (u[r] * u[j] + across * ((r == j) - u[r] * u[j]));
+                H[r * n + j] = H[(d + r) * n + d + j] = v;
+                H[r * n + d + j] = H[(d + r) * n + j] = -v;
+            }
+    }
+}
+
+static tss_result tss__springs_lists(void *user, const tss_ctx *c, const double *x, const double *d,
+                                     double t_max, tss_stencils *out) {
+    const tss__springs *e = (const tss__springs *)user;
+    (void)c, (void)x, (void)d, (void)t_max;
+    out->count = e->count, out->node = e->node, out->pattern = 1;
+    return TSS_OK;
+}
+
+static void tss__springs_describe(void *user, const tss_ctx *c, int id, char *text, size_t size) {
+    const int *n = ((const tss__springs *)user)->node + (size_t)id * 2;
+    (void)c;
+    snprintf(text, size, "spring %d (nodes %d %d)", id, n[0], n[1]);
+}
+
+static void tss__springs_destroy(void *user, const tss_host *host) {
+    tss__springs *e = (tss__springs *)user;
+    if (!e) return;
+    tss_free(host, e->node, (size_t)e->count * 2 * sizeof *e->node);
+    tss_free(host, e->k, (size_t)e->count * sizeof *e->k);
+    tss_free(host, e->rest, (size_t)e->count * sizeof *e->rest);
+    tss_free(host, e, sizeof *e);
+}
+
+tss_spring_def tss_spring_def_default(void) {
+    tss_spring_def d;
+    memset(&d, 0, sizeof d);
+    d.dim = 3;
+    d.stiffness = 1;
+    return d;
+}
+
+static tss__springs *tss__springs_alloc(const tss_host *host, int count, int dim) {
+    tss__springs *e = (tss__springs *)tss_alloc(host, sizeof *e);
+    if (!e) return NULL;
+    memset(e, 0, sizeof *e);
+    e->count = count, e->dim = dim;
+    e->node = (int *)tss_alloc(host, (size_t)count * 2 * sizeof *e->node);
+    e->k = (double *)tss_alloc(host, (size_t)count * sizeof *e->k);
+    e->rest = (double *)tss_alloc(host, (size_t)count * sizeof *e->rest);
+    if (e->node && e->k && e->rest) return e;
+    tss__springs_destroy(e, host);
+    return NULL;
+}
+
+// Stiffness and rest length of each spring.
+static tss_result tss__springs_fill(tss__springs *e, const tss_spring_def *def) {
+    for (int i = 0; i < e->count; i++) {
+        double u[3];
+        e->k[i] = def->stiffnesses ? def->stiffnesses[i] : def->stiffness;
+        e->rest[i] = def->rest_length ? def->rest_length[i] : tss__spring_load(e, i, def->X, u);
+        if (!(e->k[i] > 0) || !(e->k[i] <= 1e300)) return TSS_ERROR_BAD_MATERIAL;
+        if (!(e->rest[i] >= 0) || !(e->rest[i] <= 1e300)) return TSS_ERROR_BAD_ARGUMENT;
+        if (e->node[2 * i] == e->node[2 * i + 1]) return TSS_ERROR_BAD_MESH;
+    }
+    return TSS_OK;
+}
+
+tss_result tss_spring_energy(const tss_host *host, const tss_spring_def *def, tss_energy_def *out) {
+    if (!host || !def || !out || def->springs < 1 || (def->dim != 2 && def->dim != 3) ||
+        (!def->X && !def->rest_length) || !tss__nodes_ok(def->node, (size_t)def->springs * 2))
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__springs *e = tss__springs_alloc(host, def->springs, def->dim);
+    if (!e) return TSS_ERROR_NO_MEMORY;
+    memcpy(e->node, def->node, (size_t)def->springs * 2 * sizeof *e->node);
+    const tss_result r = tss__springs_fill(e, def);
+    if (r != TSS_OK) {
+        tss__springs_destroy(e, host);
+        return r;
+    }
+    *out = tss__thin_energy("springs", 2, e);
+    out->lists = tss__springs_lists;
+    out->value = tss__springs_value;
+    out->gradient = tss__springs_gradient;
+    out->hessian = tss__springs_hessian;
+    out->describe = tss__springs_describe;
+    out->destroy = tss__springs_destroy;
     return TSS_OK;
 }
 
@@ -2808,7 +3492,7 @@ typedef void tss__micro(int k, const double *a, ptrdiff_t as, const double *b, d
 typedef struct tss__kernel {
     tss__micro *run;
     int mr, nr;
-    int direct;  // partial strips may be read in place (the kernel masks its loads)
+    int direct;  // strips are read in place (the kernel masks its loads)
 } tss__kernel;
 
 // C (w × v) = β C + α T, T the whole tile with leading dimension mr.
@@ -2965,6 +3649,28 @@ static void tss__pack(int w, int width, int k, const double *a, ptrdiff_t rs, pt
     }
 }
 
+// All rows of a block of B (n × k) in panels of nr: whole columns are read in order, so that the
+// hardware sees streams.
+static void tss__pack_panels(int nr, int n, int k, const double *b, ptrdiff_t rs, ptrdiff_t ps,
+                             double *out) {
+    int whole = rs == 1 ? n / nr * nr : 0;
+    for (int p = 0; whole && p < k; p++) {
+        const double *from = b + p * ps;
+        for (int j = 0; j < whole; j += nr) {
+            double *to = out + (ptrdiff_t)j * k + (ptrdiff_t)p * nr;
+            for (int i = 0; i < nr; i += 4) memcpy(to + i, from + j + i, 4 * sizeof(double));
+        }
+    }
+    for (int j = whole; j < n; j += nr)
+        tss__pack(tss__min_int(nr, n - j), nr, k, b + j * rs, rs, ps, out + (ptrdiff_t)j * k);
+}
+
+// Doubles by which the columns of A lie off a cache line, where strips are read in place.
+static int tss__misaligned(const tss__kernel *q, const double *a, ptrdiff_t ars, ptrdiff_t aps) {
+    if (!q->direct || ars != 1 || aps % 8) return 0;
+    return (int)((uintptr_t)a / sizeof(double) % 8);
+}
+
 // One slab of at most KC steps.
 static void tss__gemm_slab(const tss__kernel *q, int m, int n, int k, double alpha, const double *a,
                            ptrdiff_t ars, ptrdiff_t aps, const double *b, ptrdiff_t brs,
@@ -2972,15 +3678,15 @@ static void tss__gemm_slab(const tss__kernel *q, int m, int n, int k, double alp
     double as[TSS__MR_MAX * TSS__KC], bs[TSS__NC * TSS__KC];
     for (int j0 = 0; j0 < n; j0 += TSS__NC) {
         int nc = tss__min_int(TSS__NC, n - j0);
-        for (int j = 0; j < nc; j += q->nr)
-            tss__pack(tss__min_int(q->nr, nc - j), q->nr, k, b + (j0 + j) * brs, brs, bps,
-                      bs + (ptrdiff_t)j * k);
-        for (int i = 0; i < m; i += q->mr) {
-            int w = tss__min_int(q->mr, m - i);
+        tss__pack_panels(q->nr, nc, k, b + j0 * brs, brs, bps, bs);
+        // The first strip ends where the others begin on a cache line.
+        for (int i = 0, w = q->mr - tss__misaligned(q, a, ars, aps); i < m; i += w, w = q->mr) {
+            w = tss__min_int(w, m - i);
             const double *strip = a + i * ars;
             ptrdiff_t step = aps;
-            // Packing a strip pays from three panels of B on.
-            if (ars != 1 || (w < q->mr && !q->direct) || nc > 2 * q->nr) {
+            // A strip read in place is as fast where partial ones can be masked; packing pays
+            // elsewhere from three panels of B on.
+            if (ars != 1 || (!q->direct && (w < q->mr || nc > 2 * q->nr))) {
                 tss__pack(w, q->mr, k, strip, ars, aps, as);
                 strip = as, step = q->mr;
             }
@@ -3016,6 +3722,18 @@ static void tss__gemm_tn(int m, int n, int k, double alpha, const double *a, int
     tss__gemm_any(m, n, k, alpha, a, lda, 1, b, ldb, 1, beta, c, ldc);
 }
 
+// y += x.
+static void tss__add_to(int m, const double *x, double *y) {
+    int i = 0;
+    for (; i + 4 <= m; i += 4) {
+        double s[4], t[4];
+        memcpy(s, x + i, sizeof s), memcpy(t, y + i, sizeof t);
+        for (int k = 0; k < 4; k++) t[k] += s[k];
+        memcpy(y + i, t, sizeof t);
+    }
+    for (; i < m; i++) y[i] += x[i];
+}
+
 enum { TSS__TRI = 8 };     // order of the triangles solved by hand
 enum { TSS__DIAG = 48 };   // squares on the diagonal computed whole: a multiple of 1, 2, 3 and 8
 
@@ -3035,30 +3753,66 @@ static void tss__syrk(int n, int k, const double *a, int lda, double beta, doubl
 }
 
 // Eight rows of B := B L⁻ᵀ in registers, n ≤ 8: forward substitution over the columns.
-static void tss__trsm_rows8(int n, const double *l, int ldl, double *b, int ldb) {
+static void tss__trsm_rows8(int n, const double *l, int ldl, const double *inv, double *b,
+                            int ldb) {
     double x[TSS__TRI][8];
     for (int j = 0; j < n; j++) {
-        double s[8], inv = 1 / l[j + (ptrdiff_t)j * ldl];
+        double s[8];
         memcpy(s, b + (ptrdiff_t)j * ldb, sizeof s);
         for (int i = 0; i < j; i++) {
             double f = l[j + (ptrdiff_t)i * ldl];
             for (int r = 0; r < 8; r++) s[r] -= x[i][r] * f;
         }
-        for (int r = 0; r < 8; r++) x[j][r] = s[r] * inv;
+        for (int r = 0; r < 8; r++) x[j][r] = s[r] * inv[j];
         memcpy(b + (ptrdiff_t)j * ldb, x[j], sizeof s);
     }
 }
 
+#ifdef TSS__X86
+// Rows [0, m) in vectors of eight, two at a time so that their chains overlap.
+__attribute__((target("avx512f"))) static void tss__trsm_rows_avx512(int m, int n, const double *l,
+                                                                     int ldl, const double *inv,
+                                                                     double *b, int ldb) {
+    for (int r = 0; r < m; r += 16) {
+        __m512d x[TSS__TRI], y[TSS__TRI];
+        int left = m - r;
+        __mmask8 mx = (__mmask8)(left >= 8 ? 255 : (1 << left) - 1);
+        __mmask8 my = (__mmask8)(left >= 16 ? 255 : left > 8 ? (1 << (left - 8)) - 1 : 0);
+        for (int j = 0; j < n; j++) {
+            double *at = b + r + (ptrdiff_t)j * ldb;
+            __m512d s = _mm512_maskz_loadu_pd(mx, at), t = _mm512_maskz_loadu_pd(my, at + 8);
+            for (int i = 0; i < j; i++) {
+                __m512d f = _mm512_set1_pd(l[j + (ptrdiff_t)i * ldl]);
+                s = _mm512_fnmadd_pd(x[i], f, s);
+                t = _mm512_fnmadd_pd(y[i], f, t);
+            }
+            x[j] = _mm512_mul_pd(s, _mm512_set1_pd(inv[j]));
+            y[j] = _mm512_mul_pd(t, _mm512_set1_pd(inv[j]));
+            _mm512_mask_storeu_pd(at, mx, x[j]);
+            _mm512_mask_storeu_pd(at + 8, my, y[j]);
+        }
+    }
+}
+#endif
+
 // B (m × n) := B L⁻ᵀ, n ≤ 8.
 static void tss__trsm_base(int m, int n, const double *l, int ldl, double *b, int ldb) {
     int r = 0;
-    for (; r + 8 <= m; r += 8) tss__trsm_rows8(n, l, ldl, b + r, ldb);
+    double inv[TSS__TRI];
+    for (int j = 0; j < n; j++) inv[j] = 1 / l[j + (ptrdiff_t)j * ldl];
+#ifdef TSS__X86
+    if (__builtin_cpu_supports("avx512f")) {
+        tss__trsm_rows_avx512(m, n, l, ldl, inv, b, ldb);
+        return;
+    }
+#endif
+    for (; r + 8 <= m; r += 8) tss__trsm_rows8(n, l, ldl, inv, b + r, ldb);
     for (; r < m; r++) {
         for (int j = 0; j < n; j++) {
             double s = b[r + (ptrdiff_t)j * ldb];
             for (int i = 0; i < j; i++)
                 s -= b[r + (ptrdiff_t)i * ldb] * l[j + (ptrdiff_t)i * ldl];
-            b[r + (ptrdiff_t)j * ldb] = s * (1 / l[j + (ptrdiff_t)j * ldl]);
+            b[r + (ptrdiff_t)j * ldb] = s * inv[j];
         }
     }
 }
@@ -3736,15 +4490,21 @@ typedef struct tss__sym {
     tss__buf buf[TSS__S_COUNT];
 } tss__sym;
 
+// Rows as stored: whole cache lines, so that all columns of a panel are aligned alike.
+static int64_t tss__padded(int64_t rows) { return (rows + 7) & ~(int64_t)7; }
+
 // Doubles before panel column c (a multiple of TSS__PANEL) of a trapezoid with rows rows.
 static int64_t tss__panel_at(int64_t rows, int64_t c) {
-    return c * rows - c * (c - TSS__PANEL) / 2;
+    return c * tss__padded(rows) - c * (c - TSS__PANEL) / 2;
 }
+
+// Leading dimension of that panel.
+static int tss__panel_ld(int rows, int c) { return (int)tss__padded(rows) - c; }
 
 // Doubles of a trapezoid of rows rows and cols columns.
 static int64_t tss__panel_size(int64_t rows, int64_t cols) {
     int64_t last = cols / TSS__PANEL * TSS__PANEL;
-    return tss__panel_at(rows, last) + (cols - last) * (rows - last);
+    return tss__panel_at(rows, last) + (cols - last) * (tss__padded(rows) - last);
 }
 
 // Flops of a front with K columns over M more rows: Σ (r_j)² over its columns' lengths.
@@ -4775,8 +5535,9 @@ static double *tss__panel(double *t, int R, int c) { return t + tss__panel_at(R,
 static void tss__add_block(const tss__numeric *w, const tss__view *v, int i, int j,
                            const double *m, const uint8_t *fi, const uint8_t *fj) {
     int d = w->d, c = j * d / TSS__PANEL * TSS__PANEL, R = v->K + v->M;
-    double *p = tss__panel(v->L, R, c) + (i * d - c) + (ptrdiff_t)(j * d - c) * (R - c);
-    for (int a = 0; a < d; a++, p += R - c) {
+    int ld = tss__panel_ld(R, c);
+    double *p = tss__panel(v->L, R, c) + (i * d - c) + (ptrdiff_t)(j * d - c) * ld;
+    for (int a = 0; a < d; a++, p += ld) {
         for (int b = 0; b < d; b++) {
             if (fi && (fi[b] || fj[a])) continue;
             p[b] += m[a * d + b];
@@ -4801,8 +5562,9 @@ static void tss__add_column(const tss__numeric *w, const tss__view *v, int j) {
         }
     }
     int c = j * d / TSS__PANEL * TSS__PANEL, R = v->K + v->M;
-    double *p = tss__panel(v->L, R, c) + (j * d - c) + (ptrdiff_t)(j * d - c) * (R - c);
-    for (int a = 0; a < d; a++, p += R - c + 1) {
+    int ld = tss__panel_ld(R, c);
+    double *p = tss__panel(v->L, R, c) + (ptrdiff_t)(j * d - c) * (ld + 1);
+    for (int a = 0; a < d; a++, p += ld + 1) {
         if (fj && fj[a]) *p = 1;
         diag[a] = *p;
     }
@@ -4818,15 +5580,15 @@ static int tss__lower_bound(const int *rel, int lo, int hi, int at) {
     return lo;
 }
 
-// dst += src for one column of a child's U: rows i of the child (nodes) go to rel[i] − base.
-static void tss__add_runs(const int *rel, int i, int end, int d, const double *src, double *dst) {
+// dst += src for the d columns of one node of a child's U: rows i of the child (nodes) go to rel[i].
+static void tss__add_runs(const int *rel, int i, int end, int d, const double *src, int src_ld,
+                          double *dst, int dst_ld) {
     while (i < end) {
         int t = rel[i], run = 1;
         while (i + run < end && rel[i + run] == t + run) run++;
         const double *s = src + (ptrdiff_t)i * d;
         double *q = dst + (ptrdiff_t)t * d;
-        int m = run * d;
-        for (int k = 0; k < m; k++) q[k] += s[k];
+        for (int a = 0; a < d; a++, s += src_ld, q += dst_ld) tss__add_to(run * d, s, q);
         i += run;
     }
 }
@@ -4847,10 +5609,10 @@ static void tss__add_children(const tss__numeric *w, const tss__view *v, int r0,
         const double *U = tss__update_of(w, ch, v->local);
         for (; j < jend; j++) {
             int c = j * d / TSS__PANEL * TSS__PANEL, i = tss__max_int(lo, j);
-            const double *src = U + tss__panel_at(M, c) - c + (ptrdiff_t)(j * d - c) * (M - c);
+            int sld = tss__panel_ld(M, c);
+            const double *src = U + tss__panel_at(M, c) - c + (ptrdiff_t)(j * d - c) * sld;
             double *dst = t + (ptrdiff_t)((rel[j] - o) * d) * ld - (ptrdiff_t)o * d;
-            for (int a = 0; a < d; a++, src += M - c, dst += ld)
-                tss__add_runs(rel, i, hi, d, src, dst);
+            tss__add_runs(rel, i, hi, d, src, sld, dst, ld);
         }
     }
 }
@@ -4858,7 +5620,7 @@ static void tss__add_children(const tss__numeric *w, const tss__view *v, int r0,
 // Columns [c, c + STRIP) of L before elimination.
 static void tss__assemble_strip(const tss__numeric *w, const tss__view *v, int c) {
     int R = v->K + v->M, d = w->d, end = tss__min_int(v->K, c + TSS__STRIP);
-    int pc = c / TSS__PANEL * TSS__PANEL, ld = R - pc;
+    int pc = c / TSS__PANEL * TSS__PANEL, ld = tss__panel_ld(R, pc);
     double *p = tss__panel(v->L, R, pc);
     memset(p + (ptrdiff_t)(c - pc) * ld, 0, (size_t)(end - c) * (size_t)ld * sizeof(double));
     for (int j = c / d; j < end / d; j++) tss__add_column(w, v, j);
@@ -4871,8 +5633,9 @@ static void tss__update_panel(const tss__view *v, int c, int r, int rows) {
     double *p = tss__panel(v->L, R, c) + (r - c);
     for (int q = 0; q < c; q += TSS__PANEL) {
         const double *l = tss__panel(v->L, R, q);
-        tss__gemm_nt(rows, width, TSS__PANEL, -1, l + (r - q), R - q, l + (c - q), R - q, 1, p,
-                     R - c);
+        int ld = tss__panel_ld(R, q);
+        tss__gemm_nt(rows, width, TSS__PANEL, -1, l + (r - q), ld, l + (c - q), ld, 1, p,
+                     tss__panel_ld(R, c));
     }
 }
 
@@ -4880,31 +5643,33 @@ static void tss__update_panel(const tss__view *v, int c, int r, int rows) {
 static void tss__finish_panel(const tss__view *v, int c, int r, int rows) {
     int R = v->K + v->M;
     double *p = tss__panel(v->L, R, c);
-    tss__trsm(rows, tss__min_int(TSS__PANEL, v->K - c), p, R - c, p + (r - c), R - c);
+    int ld = tss__panel_ld(R, c);
+    tss__trsm(rows, tss__min_int(TSS__PANEL, v->K - c), p, ld, p + (r - c), ld);
 }
 
 // Cholesky of the diagonal of panel c; −1 or the failing unknown (in the order of L).
 static int tss__factor_diagonal(const tss__numeric *w, const tss__view *v, int c) {
-    int at = w->y->first[v->f] * w->d + c;
-    int bad = tss__potrf(tss__min_int(TSS__PANEL, v->K - c), tss__panel(v->L, v->K + v->M, c),
-                         v->K + v->M - c, (double *)w->c->diag.p + at, w->c->def.pivot_tol);
+    int at = w->y->first[v->f] * w->d + c, R = v->K + v->M;
+    int bad = tss__potrf(tss__min_int(TSS__PANEL, v->K - c), tss__panel(v->L, R, c),
+                         tss__panel_ld(R, c), (double *)w->c->diag.p + at, w->c->def.pivot_tol);
     return bad < 0 ? -1 : at + bad;
 }
 
 // Tile of U: rows [r, r + rows) of its panel c; r == c: the tile on the diagonal.
 static void tss__update_tile(const tss__numeric *w, const tss__view *v, int c, int r, int rows) {
-    int R = v->K + v->M, width = tss__min_int(TSS__PANEL, v->M - c), ld = v->M - c, d = w->d;
+    int R = v->K + v->M, width = tss__min_int(TSS__PANEL, v->M - c), d = w->d;
+    int ld = tss__panel_ld(v->M, c);
     double *panel = tss__panel(v->U, v->M, c), *t = panel + (r - c);
     for (int q = 0; q < v->K; q += TSS__PANEL) {
         const double *l = tss__panel(v->L, R, q) + (v->K - q);
-        int depth = tss__min_int(TSS__PANEL, v->K - q), skip = 0;
+        int depth = tss__min_int(TSS__PANEL, v->K - q), skip = 0, lq = tss__panel_ld(R, q);
         if (r == c) {
             skip = width;
-            tss__syrk(width, depth, l + c, R - q, q ? 1 : 0, t, ld);
+            tss__syrk(width, depth, l + c, lq, q ? 1 : 0, t, ld);
         }
         if (rows > skip)
-            tss__gemm_nt(rows - skip, width, depth, -1, l + r + skip, R - q, l + c, R - q,
-                         q ? 1 : 0, t + skip, ld);
+            tss__gemm_nt(rows - skip, width, depth, -1, l + r + skip, lq, l + c, lq, q ? 1 : 0,
+                         t + skip, ld);
     }
     int o = (v->K + c) / d;
     tss__add_children(w, v, (v->K + r) / d, (v->K + r + rows) / d, o, o + width / d, o, panel, ld);
@@ -5090,7 +5855,7 @@ static void tss__slab_open(const tss__solver *w, int f, int c, int r, tss__slab 
     s->R = s->K + (int)(y->rowptr[f + 1] - y->rowptr[f]) * y->d;
     s->width = tss__min_int(TSS__PANEL, s->K - c);
     s->rows = tss__min_int(TSS__SOLVE_ROWS, s->R - r);
-    s->ld = s->R - c;
+    s->ld = tss__panel_ld(s->R, c);
     s->l = tss__panel((double *)w->c->L.p + y->loff[f], s->R, c) + (r - c);
 }
 
@@ -7328,6 +8093,7 @@ void tss_world_destroy(tss_world *w) {
 }
 
 const char *tss_world_error(const tss_world *w) { return w ? w->error : "no world"; }
+const tss_host *tss_world_host(const tss_world *w) { return &w->host; }
 int tss_world_dim(const tss_world *w) { return w->dim; }
 int tss_world_nodes(const tss_world *w) { return w->n; }
 double tss_world_time(const tss_world *w) { return w->time; }
@@ -7511,7 +8277,7 @@ typedef struct tss__iter {
     int small_steps;     // iterates in a row with tiny steps
 } tss__iter;
 
-static double tss__dot(const double *a, const double *b, int count) {
+static double tss__dot_blocks(const double *a, const double *b, int count) {
     double total = 0;  // blocks of 4096 summed in order: the same on any number of threads
     for (int from = 0; from < count; from += 4096) {
         int to = from + 4096 < count ? from + 4096 : count;
@@ -7615,7 +8381,7 @@ static tss_result tss__direction(tss_world *w, tss__iter *it, tss_status *failed
             d[node[k] * dim + c] = y[k * dim + c];
             it->dnorm = tss__max(it->dnorm, fabs(y[k * dim + c]));
         }
-    it->gd = tss__dot(g, d, w->n * dim);
+    it->gd = tss__dot_blocks(g, d, w->n * dim);
     tss__phase(w, TSS_PHASE_LINEAR);
     return TSS_OK;
 }
@@ -7665,7 +8431,7 @@ static tss_result tss__allow(tss_world *w, const tss__iter *it, tss__allowance *
     tss__trial(w, it, eps);
     tss_result r = tss__gradient_at(w, tss__f64(&w->x_trial), tss__f64(&w->g_trial), 1);
     if (r != TSS_OK) return r;
-    a->curvature = (tss__dot(tss__f64(&w->g_trial), tss__f64(&w->d), w->n * w->dim) - it->gd) / eps;
+    a->curvature = (tss__dot_blocks(tss__f64(&w->g_trial), tss__f64(&w->d), w->n * w->dim) - it->gd) / eps;
     return TSS_OK;
 }
 
@@ -7691,7 +8457,7 @@ static tss_result tss__line_search(tss_world *w, tss__iter *it, int *found) {
         int ok = isfinite(E) && E <= it->E + rise + 1e-4 * alpha * tss__min(it->gd, 0);
         if (!ok && isfinite(E) && E <= it->E + noise) {
             r = tss__gradient_at(w, tss__f64(&w->x_trial), tss__f64(&w->g_trial), 1);
-            double slope = tss__dot(tss__f64(&w->g_trial), tss__f64(&w->d), w->n * w->dim);
+            double slope = tss__dot_blocks(tss__f64(&w->g_trial), tss__f64(&w->d), w->n * w->dim);
             // Far below the noise the slope is noise too: x is as good as doubles allow.
             ok = fabs(slope) <= 0.9998 * fabs(it->gd) || fabs(it->gd) <= 1e-16 * it->size;
         }

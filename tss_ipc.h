@@ -498,12 +498,12 @@ double tss_ipc_feature_distance(tss_ipc_kind kind, int dim, int feature, const d
 // >>barrier (private)
 // ---------------------------------------------------------------------------------------------
 
-TSS__INLINE uint64_t tss__bits(double a) {
+TSS__INLINE uint64_t tss__ipc_bits(double a) {
     uint64_t u;
     memcpy(&u, &a, 8);
     return u;
 }
-TSS__INLINE double tss__from_bits(uint64_t u) {
+TSS__INLINE double tss__ipc_from_bits(uint64_t u) {
     double a;
     memcpy(&a, &u, 8);
     return a;
@@ -512,12 +512,12 @@ TSS__INLINE double tss__from_bits(uint64_t u) {
 // ln z for normal z > 0, below 1 ulp: z = 2^k (1 + f), 1 + f ∈ [√½, √2), and with s = f/(2 + f)
 // ln(1 + f) = 2 artanh s (minimax coefficients of the usual C libraries). No branch, no call:
 // the same bits on every platform, and a vector of them where libm's log gives one.
-TSS__INLINE double tss__log(double z) {
+TSS__INLINE double tss__ipc_log(double z) {
     const uint64_t sqrt_half = 0x3fe6a09e667f3bcdULL, one = 0x3ff0000000000000ULL;
-    uint64_t u = tss__bits(z) - sqrt_half + one;  // its exponent field is k + 1023
+    uint64_t u = tss__ipc_bits(z) - sqrt_half + one;  // its exponent field is k + 1023
     // An integer below 2^52 in the mantissa of 2^52 becomes a double by one subtraction.
-    double k = tss__from_bits((u >> 52) | 0x4330000000000000ULL) - (4503599627370496.0 + 1023);
-    double f = tss__from_bits((u & 0x000fffffffffffffULL) + sqrt_half) - 1;
+    double k = tss__ipc_from_bits((u >> 52) | 0x4330000000000000ULL) - (4503599627370496.0 + 1023);
+    double f = tss__ipc_from_bits((u & 0x000fffffffffffffULL) + sqrt_half) - 1;
     double s = f / (2 + f), z2 = s * s, w = z2 * z2, half = 0.5 * f * f;
     double t1 = w * (3.999999999940941908e-01 +
                      w * (2.222219843214978396e-01 + w * 1.531383769920937332e-01));
@@ -536,7 +536,7 @@ typedef struct tss__barrier {
 TSS__INLINE tss__barrier tss__barrier_of(double d, double dhat) {
     // Below this ln has no exponent left; nothing that is feasible comes there.
     int touch = !(d > DBL_MIN), in = d < dhat;
-    double dd = touch ? 1 : d, z = dhat / dd, gap = dhat - dd, ln = tss__log(dd / dhat);
+    double dd = touch ? 1 : d, z = dhat / dd, gap = dhat - dd, ln = tss__ipc_log(dd / dhat);
     tss__barrier o;
     o.b = -gap * gap * ln;
     o.b1 = gap * (2 * ln - z + 1);
