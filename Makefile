@@ -10,19 +10,13 @@ HEADERS := $(wildcard *.h)
 VIEWERS := $(wildcard examples/*.h)
 # OMP_NUM_THREADS or `--threads N` choose the threads; no result depends on them.
 
-# Serial OpenBLAS where a system has it: the library calls BLAS from several threads at once, and a
-# threaded BLAS would change bits with its thread count.
-SERIAL_BLAS := $(firstword $(wildcard /usr/lib/*/openblas-serial /usr/lib64/openblas-serial))
-BREW        := $(shell command -v brew >/dev/null 2>&1 && brew --prefix)
-ifneq ($(SERIAL_BLAS),)
-BLAS := -L$(SERIAL_BLAS) -Wl,-rpath,$(SERIAL_BLAS) -lopenblas
-else
-BLAS := $(if $(BREW),-L$(BREW)/opt/openblas/lib -I$(BREW)/opt/openblas/include) -lopenblas
-endif
+BREW := $(shell command -v brew >/dev/null 2>&1 && brew --prefix)
 OPENMP := -fopenmp
-LIBS   := $(BLAS) -lmetis -lm
-ALL    := $(STD) $(CFLAGS) $(WARN) $(OPENMP) -I. -Iexamples -Itests $(DEFS)
-NOPKG  := -DTSS_NO_OPENMP -DTSS_NO_LAPACK -DTSS_NO_METIS
+LIBS   := $(if $(BREW),-L$(BREW)/lib) -lmetis -lm
+ALL    := $(STD) $(CFLAGS) $(WARN) $(OPENMP) $(if $(BREW),-I$(BREW)/include) -I. -Iexamples -Itests $(DEFS)
+# Tests compile the headers many times over: -O1 keeps that short, and bits do not depend on it.
+TEST_CFLAGS ?= -O1 -march=native -g
+MAKEFLAGS += -j$(shell nproc 2>/dev/null || echo 2)
 
 .PHONY: help all deps demo test examples run-examples bench sanitize fuzz nodeps compat clean
 
@@ -53,7 +47,7 @@ $(BUILD)/%: examples/%.c $(HEADERS) $(VIEWERS) tests/checker.h
 
 $(BUILD)/test_%: tests/test_%.c $(HEADERS) $(VIEWERS) $(wildcard tests/*.h)
 	@mkdir -p $(BUILD)
-	$(CC) $(ALL) $< -o $@ -lcmocka -lcjson -lpng $(LIBS) -lpthread
+	$(CC) $(subst $(CFLAGS),$(TEST_CFLAGS),$(ALL)) $< -o $@ -lcmocka -lcjson -lpng $(LIBS) -lpthread
 
 $(BUILD)/contact_reference $(BUILD)/ccd_queries: $(BUILD)/%: tests/%.c $(HEADERS)
 	@mkdir -p $(BUILD)

@@ -1,4 +1,66 @@
-/* tss.h: deformable solids that bend, squash and touch (doc block: written last) */
+/* tss.h: soft bodies that bend, squash and touch; a C library in a single header
+ *
+ * What it is: a simulator of contacting elastodynamics. Bodies are meshes of tetrahedra (3D) or
+ * triangles (2D); each time step minimises an incremental potential (paper A: "Trading Spaces",
+ * Trusty et al. 2024, §3.1, Eq. 1-4) with Newton's method to a tolerance you set. With tss_ipc.h
+ * bodies never pass through each other, and with the default material elements never invert.
+ *
+ * Set-up, in one .c or .cpp file of your program:
+ *     #define TSS_IMPLEMENTATION
+ *     #include "tss.h"
+ * and #include "tss.h" wherever you call it. Link -lm, and -lmetis unless TSS_NO_METIS.
+ *
+ * The smallest program:
+ *     #define TSS_IMPLEMENTATION
+ *     #include "tss.h"
+ *     int main(void) {
+ *         const double X[12] = {0, 0, 0,  1, 0, 0,  0, 1, 0,  0, 0, 1};
+ *         const int tet[4] = {0, 1, 2, 3};
+ *         tss_world_def wd = tss_world_def_default();
+ *         tss_world *w;
+ *         if (tss_world_create(&wd, &w) != TSS_OK) return 1;
+ *         tss_body_def bd = tss_body_def_default();
+ *         bd.nodes = 4, bd.X = X, bd.cells = 1, bd.cell = tet;
+ *         if (tss_body_add(w, &bd, NULL) != TSS_OK) return puts(tss_world_error(w)), 1;
+ *         for (int step = 0; step < 10; step++) tss_world_step(w, NULL);
+ *         printf("fell to y = %g m\n", tss_world_positions(w)[1]);
+ *         tss_world_destroy(w);
+ *     }
+ *
+ * Options, defined before the implementation:
+ *     TSS_NO_OPENMP  no OpenMP even if the compiler has it on; saves libgomp. host.parallel_for
+ *                    brings your own threads in either case.
+ *     TSS_NO_METIS   a built-in ordering in place of METIS; saves the library, costs 1.2 to 1.5
+ *                    times the arithmetic of a factorisation.
+ *     TSS_NO_SIMD    no intrinsics: plain loops. Slower factorisation (docs/performance.md).
+ *     TSS_NO_LAPACK  accepted and without effect: the dense kernels are built in. Debian's serial
+ *                    OpenBLAS returned wrong products when called from several threads at once,
+ *                    and a threaded BLAS changes bits with the number of threads.
+ *     TSS_ASSERT(c)  what to do about a caller's bug; default assert.
+ *     TSS_API        linkage of public functions; default extern.
+ *
+ * Memory: all through tss_host.alloc. A step allocates only when some array reaches a new
+ * high-water mark. METIS has no allocator hook: it uses malloc, inside the first solve after a
+ * change of the scene or of the contacts' pattern, one caller at a time.
+ * Threads: a world belongs to one thread at a time; different worlds are independent (except for
+ * METIS, see above). Work inside is spread by OpenMP or tss_host.parallel_for.
+ * Determinism: the same bits for any number of threads, on the same machine and build. Work is cut
+ * into fixed blocks and summed in fixed order; nothing that alters a result reads a clock, except
+ * tss_world_step_for.
+ * Errors: three kinds. A caller's bug trips TSS_ASSERT; bad input and lack of memory return a
+ * tss_result, say why in tss_world_error and change nothing; a step that could not be solved to
+ * its tolerance is a tss_status in tss_step_info, and its state is still feasible.
+ * Limits: linear elements; 2^31 matrix blocks; one step length for the whole world.
+ *
+ * CONVENTIONS
+ *     Units are SI: metre, kilogram, second, newton, pascal. 2D is plane strain, 1 m deep.
+ *     Positions are n × d, node by node. Small matrices are row-major. Indices start at 0.
+ *     Tets (v0 v1 v2 v3) have det[x1 − x0, x2 − x0, x3 − x0] > 0; 2D triangles run anti-clockwise;
+ *     surface triangles run anti-clockwise seen from outside.
+ *     Energies are sums w_s W_s(x) over stencils; a force is minus a gradient.
+ *     Names are the field's and the papers': x̃ predicted positions, h step, αh² the integrator's
+ *     factor on forces, F deformation gradient, J = det F, d̂ reach of the barrier, κ its stiffness.
+ */
 #ifndef TSS_H
 #define TSS_H
 
@@ -209,7 +271,7 @@ typedef enum tss_material_kind {
     // mu E:E + lambda/2 (tr E)², E = (FᵀF − I)/2. Weak in compression: it gives way at a stretch of
     // 0.58 and has no stress at 0. For thin bodies that bend more than they squash.
     TSS_STVK,
-    // mu e:e + lambda/2 (tr e)², e = (F + Fᵀ)/2 − I. Its Hessian is constant; rotation costs energy.
+    // mu e:e + lambda/2 (tr e)², e = (F + Fᵀ)/2 − I. Constant Hessian; rotation costs energy.
     TSS_LINEAR,
     TSS_CUSTOM_MATERIAL,  // your density, see tss_density
     TSS_MATERIAL_KINDS
@@ -229,9 +291,9 @@ typedef struct tss_material {
     double rho;              // density of mass, kg/m³, > 0; default 1000
     // TSS_CUSTOM_MATERIAL only; E and nu still set the scales of the oracle and of contact.
     tss_density *density;
-    void *user;      // handed to density; must outlive the world
-    int has_C;       // density can give C; 0: C by central differences of P (error about 1e-9)
-    int barrier;     // psi is infinite where J <= 0: steps are cut short of it
+    void *user;   // handed to density; must outlive the world
+    int has_C;    // density can give C; 0: C by central differences of P (error about 1e-9)
+    int barrier;  // psi is infinite where J <= 0: steps are cut short of it
     // Stiffness-proportional damping, s, >= 0; default 0: none. Force −damping · H(x_t) v with the
     // projected Hessian H of the start of the step. A mode of frequency w (rad/s) loses the share
     // damping · w / 2 of critical. Not for TSS_CUSTOM_MATERIAL.
@@ -267,17 +329,17 @@ TSS_API tss_result tss_membrane_energy(const tss_host *host, const tss_membrane_
 
 // Bending of a surface at its inner edges (discrete shells, Grinspun et al. 2003):
 //   ½ k · 3‖e‖²/(A_1 + A_2) · (theta − theta_rest)²,
-// e the rest edge, A the rest areas, theta the angle between the normals, 0 when flat, positive when
-// the surface bends towards the side its normals point to. k in N·m is then the bending modulus of
-// the plate, E thickness³ / (12 (1 − nu²)): theta/(height of the edge's dual cell) is its curvature.
-// Projected Hessian: Gauss–Newton, k_e ∇theta ∇thetaᵀ.
+// e the rest edge, A the rest areas, theta the angle between the normals, 0 when flat, positive
+// when the surface bends towards the side its normals point to. k in N·m is then the bending
+// modulus of the plate, E thickness³ / (12 (1 − nu²)): theta/(height of the edge's dual cell) is
+// its curvature. Projected Hessian: Gauss–Newton, k_e ∇theta ∇thetaᵀ.
 typedef struct tss_hinge_def {
     int hinges;
-    const int *node;          // hinges × 4: edge (a, b), then the third nodes of triangle (a, b, ·)
-                              // and of triangle (b, a, ·), both counter-clockwise seen from outside
-    const double *X;          // rest positions, nodes × 3, m
-    double stiffness;         // k, N·m, > 0; default 1e-4
-    const double *rest_angle; // hinges, rad; NULL: the angles of X. Default NULL
+    const int *node;   // hinges × 4: edge (a, b), then the third nodes of triangle (a, b, ·)
+                       // and of triangle (b, a, ·), both counter-clockwise seen from outside
+    const double *X;   // rest positions, nodes × 3, m
+    double stiffness;  // k, N·m, > 0; default 1e-4
+    const double *rest_angle;  // hinges, rad; NULL: the angles of X. Default NULL
 } tss_hinge_def;
 TSS_API tss_hinge_def tss_hinge_def_default(void);
 TSS_API tss_result tss_hinge_energy(const tss_host *host, const tss_hinge_def *def,
@@ -286,12 +348,12 @@ TSS_API tss_result tss_hinge_energy(const tss_host *host, const tss_hinge_def *d
 // Springs ½ k (‖x_b − x_a‖ − L)².
 typedef struct tss_spring_def {
     int springs;
-    const int *node;           // springs × 2
-    const double *X;           // rest positions, nodes × dim, m; may be NULL if rest_length is given
-    int dim;                   // 2 or 3, default 3
-    double stiffness;          // k, N/m, > 0; default 1
-    const double *stiffnesses; // one a spring, or NULL (default)
-    const double *rest_length; // L, m, >= 0, one a spring; NULL (default): from X
+    const int *node;   // springs × 2
+    const double *X;   // rest positions, nodes × dim, m; may be NULL if rest_length is given
+    int dim;           // 2 or 3, default 3
+    double stiffness;  // k, N/m, > 0; default 1
+    const double *stiffnesses;  // one a spring, or NULL (default)
+    const double *rest_length;  // L, m, >= 0, one a spring; NULL (default): from X
 } tss_spring_def;
 TSS_API tss_spring_def tss_spring_def_default(void);
 TSS_API tss_result tss_spring_energy(const tss_host *host, const tss_spring_def *def,
@@ -310,7 +372,8 @@ typedef struct tss_bcsr {
     int64_t *row;      // n + 1: blocks of row a are row[a] .. row[a+1]-1
     int *col;          // node of each block, ascending within a row
     double *val;       // d·d numbers a block
-    uint64_t pattern;  // changes whenever row or col change; 0: unknown (always compared)
+    uint64_t pattern;  // changes whenever row or col change; 0: unknown (always compared);
+                       // UINT64_MAX is not to be used
     size_t row_bytes, col_bytes, val_bytes;  // what the arrays hold; 0: not owned
 } tss_bcsr;
 
@@ -396,7 +459,7 @@ typedef enum tss_chol_reuse {  // what the last tss_chol_analyze had to do
 
 typedef struct tss_chol_def {
     double pivot_tol;    // a pivot ≤ pivot_tol · a_jj is rounding noise: default 7e-15 (32 ε)
-    double reorder_at;   // reorder when flops exceed this many times those of the last ordering: 1.5
+    double reorder_at;   // reorder at this many times the flops of the last ordering: default 1.5
     int seed;            // of METIS; default 1
     int use_metis;       // default 1; 0: the built-in ordering (always under TSS_NO_METIS)
     int cookie;
@@ -434,6 +497,15 @@ TSS_API tss_result tss_chol_solve_refined(tss_chol *c, const tss_bcsr *A, const 
                                           const uint8_t *fixed, const double *b, double *x,
                                           int steps, double *residual);
 TSS_API void tss_chol_get_info(const tss_chol *c, tss_chol_info *info);
+// Makes the next analyze start from the ordering alone, so that what follows depends on the matrices
+// given from here on and not on those before.
+TSS_API void tss_chol_forget(tss_chol *c);
+// The kept ordering for a checkpoint: its size (0: none); order (NULL: only the size) gets n node
+// numbers, *flops what a factorisation took right after it was made.
+TSS_API int tss_chol_get_order(const tss_chol *c, int *order, double *flops);
+// Takes an ordering back: n nodes of d unknowns; n = 0: none. order must be a permutation of 0..n−1
+// (TSS_ERROR_BAD_ARGUMENT if not).
+TSS_API tss_result tss_chol_set_order(tss_chol *c, int n, int d, const int *order, double flops);
 
 // ---------------------------------------------------------------------------------------------
 // >>dense_cholesky (public)
@@ -690,7 +762,8 @@ TSS_API tss_result tss_energy_add(tss_world *w, const tss_energy_def *def, tss_e
 TSS_API tss_result tss_energy_remove(tss_world *w, tss_energy e);
 
 typedef struct tss_energy_report {
-    double gradient_error, hessian_error;  // largest relative deviation from central differences
+    double gradient_error, hessian_error;  // largest deviation from central differences, relative
+                                           // to the stencil or 1/1000 of the largest one
     int gradient_stencil, hessian_stencil;
     double psd_min;                        // smallest eigenvalue of a projected Hessian / its norm
 } tss_energy_report;
@@ -725,7 +798,9 @@ TSS_API void tss_embedding_update(const tss_embedding *e, const tss_world *w, fl
 #include <stdlib.h>
 #include <string.h>
 
-#if defined(__GNUC__) && defined(__x86_64__) && !defined(TSS_NO_SIMD)
+// (gcc for Windows misaligns vectors on the stack, bug 54412.)
+#if defined(__GNUC__) && defined(__x86_64__) && !defined(TSS_NO_SIMD) &&                          \
+    (defined(__clang__) || !defined(_WIN32))
 #include <immintrin.h>
 #define TSS__X86 1
 #endif
@@ -852,18 +927,23 @@ void tss_log(const tss_host *host, tss_log_level level, const char *format, ...)
 #define TSS_LANES 8
 typedef double tss__lanes[TSS_LANES];  // inputs are not const: C11 cannot add const to arrays
 
-// These loops pay at -O2 as well: gcc is asked for its vectoriser, and both not
-// to unroll them before it has run.
+// These loops pay at -O2 as well: the compilers are asked for their vectoriser, and not to unroll
+// them before it has run.
+// clang-format off
 #if defined(__clang__)
 #define TSS__EACH_LANE(l) \
-    _Pragma("clang loop vectorize(assume_safety) interleave(disable)") \
+    _Pragma("clang loop vectorize(assume_safety) interleave(disable)")                             \
     for (int l = 0; l < TSS_LANES; l++)
 #elif defined(__GNUC__)
 #define TSS__EACH_LANE(l) _Pragma("GCC unroll 1") for (int l = 0; l < TSS_LANES; l++)
 #else
 #define TSS__EACH_LANE(l) for (int l = 0; l < TSS_LANES; l++)
 #endif
-#if defined(__GNUC__) && !defined(__clang__)
+// clang-format on
+#if defined(__clang__)
+#pragma clang diagnostic push
+#pragma clang diagnostic ignored "-Wpass-failed"  // below -O2 there is no vectoriser to obey
+#elif defined(__GNUC__)
 #pragma GCC push_options
 #pragma GCC optimize("O3", "fp-contract=off")
 #endif
@@ -924,6 +1004,8 @@ TSS__INLINE double tss__log_tail(double f) {
     return half - s * (half + r);
 }
 
+TSS__INLINE double tss__abs(double x) { return x < 0 ? -x : x; }
+
 // x = 2^k (1 + f), x > 0 and normal, 1 + f in [√½, √2).
 TSS__INLINE void tss__split(double x, double *k, double *f) {
     const uint64_t root_half = 0x3FE6A09E667F3BCDu, one = 0x3FF0000000000000u;
@@ -961,19 +1043,19 @@ TSS__INLINE double tss__log1p(double x, double *tail) {
 
 // The entries of d × d lanes: product of a matrix and a symmetric one (xx yy zz yz xz xy, or
 // xx yy xy).
-TSS__INLINE void tss__mul_sym(int d, tss__lanes *TSS__RESTRICT A,
-                              tss__lanes *TSS__RESTRICT S, tss__lanes *TSS__RESTRICT P) {
+TSS__INLINE void tss__mul_sym(int d, tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT S,
+                              tss__lanes *TSS__RESTRICT P) {
     for (int r = 0; r < d; r++) {
         tss__lanes *a = A + r * d;
         tss__lanes *p = P + r * d;
         if (d == 2) {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a0 = a[0][l], a1 = a[1][l];
                 p[0][l] = a0 * S[0][l] + a1 * S[2][l];
                 p[1][l] = a0 * S[2][l] + a1 * S[1][l];
             }
         } else {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a0 = a[0][l], a1 = a[1][l], a2 = a[2][l];
                 double yz = S[3][l], xz = S[4][l], xy = S[5][l];
                 p[0][l] = a0 * S[0][l] + a1 * xy + a2 * xz;
@@ -984,21 +1066,22 @@ TSS__INLINE void tss__mul_sym(int d, tss__lanes *TSS__RESTRICT A,
     }
 }
 
-// C = A B, or A Bᵀ.
-TSS__INLINE void tss__mul(int d, tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT B,
-                          int transposed, tss__lanes *TSS__RESTRICT C) {
+// C = A B, or A Bᵀ; rows of C are n apart.
+TSS__INLINE void tss__mul_rows(int d, int n, tss__lanes *TSS__RESTRICT A,
+                               tss__lanes *TSS__RESTRICT B, int transposed,
+                               tss__lanes *TSS__RESTRICT C) {
     const int s = transposed ? 1 : d, c = transposed ? d : 1;
     for (int r = 0; r < d; r++) {
         tss__lanes *a = A + r * d;
-        tss__lanes *o = C + r * d;
+        tss__lanes *o = C + r * n;
         if (d == 2) {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a0 = a[0][l], a1 = a[1][l];
                 o[0][l] = a0 * B[0][l] + a1 * B[s][l];
                 o[1][l] = a0 * B[c][l] + a1 * B[c + s][l];
             }
         } else {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a0 = a[0][l], a1 = a[1][l], a2 = a[2][l];
                 o[0][l] = a0 * B[0][l] + a1 * B[s][l] + a2 * B[2 * s][l];
                 o[1][l] = a0 * B[c][l] + a1 * B[c + s][l] + a2 * B[c + 2 * s][l];
@@ -1008,18 +1091,23 @@ TSS__INLINE void tss__mul(int d, tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__R
     }
 }
 
+TSS__INLINE void tss__mul(int d, tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT B,
+                          int transposed, tss__lanes *TSS__RESTRICT C) {
+    tss__mul_rows(d, d, A, B, transposed, C);
+}
+
 // Cofactors ∂J/∂F and J.
-TSS__INLINE void tss__cofactor(int d, tss__lanes *TSS__RESTRICT F,
-                               tss__lanes *TSS__RESTRICT C, double *TSS__RESTRICT J) {
+TSS__INLINE void tss__cofactor(int d, tss__lanes *TSS__RESTRICT F, tss__lanes *TSS__RESTRICT C,
+                               double *TSS__RESTRICT J) {
     if (d == 2) {
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             double a = F[0][l], b = F[1][l], c = F[2][l], e = F[3][l];
             C[0][l] = e, C[1][l] = -c, C[2][l] = -b, C[3][l] = a;
             J[l] = a * e - b * c;
         }
         return;
     }
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double a = F[0][l], b = F[1][l], c = F[2][l];
         double p = F[3][l], q = F[4][l], r = F[5][l];
         double u = F[6][l], v = F[7][l], w = F[8][l];
@@ -1037,8 +1125,8 @@ TSS__INLINE void tss__cofactor(int d, tss__lanes *TSS__RESTRICT F,
 // G + Gᵀ + GᵀG, with invariants tr, II, III: det(I + delta) = J² = 1 + e, e = tr + II + III.
 // Densities are written in it, so that at small strain their rounding is that of mu |delta| and
 // not that of mu (a stiff body's energy would drown in it):
-//   Neo-Hookean     mu/2 (tr − log1p e) + lambda/8 log1p² e,  tr − log1p e = (e − log1p e) − II − III
-//                   P = F⁻ᵀ (mu delta + lambda ln J I)
+//   Neo-Hookean     mu/2 (tr − log1p e) + lambda/8 log1p² e,
+//                   tr − log1p e = (e − log1p e) − II − III,  P = F⁻ᵀ (mu delta + lambda ln J I)
 //   stable NH       m/2 (q − log1p q) + 3m/8 (j² − II − III) + l/2 j²,  q = tr/4, j = J − 1
 //                   P = m (3 + tr)/(4 + tr) F + (l j − 3m/4) cof F
 //   StVK            mu/4 delta:delta + lambda/8 tr²,  P = F (mu delta + lambda/2 tr I)
@@ -1060,14 +1148,13 @@ void tss_lame(double E, double nu, double *mu, double *lambda) {
 }
 
 typedef struct tss__strain {
-    tss__lanes delta[6];         // FᵀF − I: xx yy zz yz xz xy, or xx yy xy
-    tss__lanes tr, rest, delta2; // trace; II + III; delta:delta
+    tss__lanes delta[6];          // FᵀF − I: xx yy zz yz xz xy, or xx yy xy
+    tss__lanes tr, rest, delta2;  // trace; II + III; delta:delta
 } tss__strain;
 
-TSS__INLINE void tss__strain_of(int d, tss__lanes *TSS__RESTRICT F,
-                                tss__strain *TSS__RESTRICT s) {
+TSS__INLINE void tss__strain_of(int d, tss__lanes *TSS__RESTRICT F, tss__strain *TSS__RESTRICT s) {
     if (d == 2) {
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             double a = F[0][l] - 1, b = F[1][l], c = F[2][l], e = F[3][l] - 1;
             double xx = 2 * a + (a * a + c * c), yy = 2 * e + (b * b + e * e);
             double xy = (b + c) + (a * b + c * e);
@@ -1077,7 +1164,7 @@ TSS__INLINE void tss__strain_of(int d, tss__lanes *TSS__RESTRICT F,
         }
         return;
     }
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double a = F[0][l] - 1, b = F[1][l], c = F[2][l];
         double p = F[3][l], q = F[4][l] - 1, r = F[5][l];
         double u = F[6][l], v = F[7][l], w = F[8][l] - 1;
@@ -1121,7 +1208,7 @@ TSS__INLINE double tss__J_minus_1(double tr, double rest, double delta2, double 
 TSS__INLINE void tss__psi_neo_hookean(const tss__strain *TSS__RESTRICT s, const double *J,
                                       const double *mu, const double *lambda,
                                       double *TSS__RESTRICT psi) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double gap, y = tss__log_J2(s->tr[l], s->rest[l], s->delta2[l], J[l], &gap);
         double v = 0.5 * mu[l] * gap + 0.125 * lambda[l] * (y * y);
         psi[l] = J[l] > 0 ? v : HUGE_VAL;
@@ -1131,7 +1218,7 @@ TSS__INLINE void tss__psi_neo_hookean(const tss__strain *TSS__RESTRICT s, const 
 TSS__INLINE void tss__psi_stable(const tss__strain *TSS__RESTRICT s, const double *J,
                                  const double *mu, const double *lambda,
                                  double *TSS__RESTRICT psi) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double gap, tail, j = tss__J_minus_1(s->tr[l], s->rest[l], s->delta2[l], J[l], &gap);
         tss__log1p(0.25 * s->tr[l], &tail);
         psi[l] = mu[l] * (0.5 * tail + 0.375 * gap) + 0.5 * lambda[l] * (j * j);
@@ -1140,7 +1227,7 @@ TSS__INLINE void tss__psi_stable(const tss__strain *TSS__RESTRICT s, const doubl
 
 TSS__INLINE void tss__psi_stvk(const tss__strain *TSS__RESTRICT s, const double *mu,
                                const double *lambda, double *TSS__RESTRICT psi) {
-    TSS__EACH_LANE(l)
+    TSS__EACH_LANE (l)
         psi[l] = 0.25 * mu[l] * s->delta2[l] + 0.125 * lambda[l] * (s->tr[l] * s->tr[l]);
 }
 
@@ -1148,26 +1235,29 @@ TSS__INLINE void tss__psi_stvk(const tss__strain *TSS__RESTRICT s, const double 
 TSS__INLINE void tss__P_linear(int d, tss__lanes *TSS__RESTRICT F, const double *mu,
                                const double *lambda, tss__lanes *TSS__RESTRICT P) {
     tss__lanes t;
-    TSS__EACH_LANE(l) t[l] = (F[0][l] - 1) + (F[d + 1][l] - 1);
-    if (d == 3) TSS__EACH_LANE(l) t[l] += F[8][l] - 1;
+    TSS__EACH_LANE (l) t[l] = (F[0][l] - 1) + (F[d + 1][l] - 1);
+    if (d == 3)
+        TSS__EACH_LANE (l) t[l] += F[8][l] - 1;
     for (int r = 0; r < d; r++)
         for (int m = 0; m < d; m++) {
             const double *a = F[r * d + m], *b = F[m * d + r];
             double *p = P[r * d + m];
-            if (r == m) TSS__EACH_LANE(l) p[l] = 2 * mu[l] * (a[l] - 1) + lambda[l] * t[l];
-            else TSS__EACH_LANE(l) p[l] = mu[l] * (a[l] + b[l]);
+            if (r == m)
+                TSS__EACH_LANE (l) p[l] = 2 * mu[l] * (a[l] - 1) + lambda[l] * t[l];
+            else
+                TSS__EACH_LANE (l) p[l] = mu[l] * (a[l] + b[l]);
         }
 }
 
 // psi = ½ P : (F − I), being quadratic.
-TSS__INLINE void tss__psi_linear(int d, tss__lanes *F, const double *mu,
-                                 const double *lambda, double *TSS__RESTRICT psi) {
+TSS__INLINE void tss__psi_linear(int d, tss__lanes *F, const double *mu, const double *lambda,
+                                 double *TSS__RESTRICT psi) {
     TSS__ALIGN tss__lanes P[9];
     tss__P_linear(d, F, mu, lambda, P);
-    TSS__EACH_LANE(l) psi[l] = 0;
+    TSS__EACH_LANE (l) psi[l] = 0;
     for (int i = 0; i < d * d; i++) {
         const double id = i % (d + 1) ? 0.0 : 1.0;
-        TSS__EACH_LANE(l) psi[l] += 0.5 * P[i][l] * (F[i][l] - id);
+        TSS__EACH_LANE (l) psi[l] += 0.5 * P[i][l] * (F[i][l] - id);
     }
 }
 
@@ -1176,33 +1266,36 @@ TSS__INLINE void tss__S_neo_hookean(int d, const tss__strain *TSS__RESTRICT s, c
                                     const double *mu, const double *lambda,
                                     tss__lanes *TSS__RESTRICT S) {
     tss__lanes m, y;
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double gap, v = 1.0 / J[l];
         y[l] = 0.5 * lambda[l] * v * tss__log_J2(s->tr[l], s->rest[l], s->delta2[l], J[l], &gap);
         m[l] = mu[l] * v;
     }
-    for (int i = 0; i < d; i++) TSS__EACH_LANE(l) S[i][l] = m[l] * s->delta[i][l] + y[l];
-    for (int i = d; i < 3 * (d - 1); i++) TSS__EACH_LANE(l) S[i][l] = m[l] * s->delta[i][l];
+    for (int i = 0; i < d; i++)
+        TSS__EACH_LANE (l) S[i][l] = m[l] * s->delta[i][l] + y[l];
+    for (int i = d; i < 3 * (d - 1); i++)
+        TSS__EACH_LANE (l) S[i][l] = m[l] * s->delta[i][l];
 }
 
 TSS__INLINE void tss__S_stvk(int d, const tss__strain *TSS__RESTRICT s, const double *mu,
                              const double *lambda, tss__lanes *TSS__RESTRICT S) {
     for (int i = 0; i < d; i++)
-        TSS__EACH_LANE(l) S[i][l] = mu[l] * s->delta[i][l] + 0.5 * lambda[l] * s->tr[l];
-    for (int i = d; i < 3 * (d - 1); i++) TSS__EACH_LANE(l) S[i][l] = mu[l] * s->delta[i][l];
+        TSS__EACH_LANE (l) S[i][l] = mu[l] * s->delta[i][l] + 0.5 * lambda[l] * s->tr[l];
+    for (int i = d; i < 3 * (d - 1); i++)
+        TSS__EACH_LANE (l) S[i][l] = mu[l] * s->delta[i][l];
 }
 
-TSS__INLINE void tss__P_stable(int d, tss__lanes *TSS__RESTRICT F,
-                               tss__lanes *TSS__RESTRICT C, const tss__strain *s,
-                               const double *J, const double *mu, const double *lambda,
-                               tss__lanes *TSS__RESTRICT P) {
+TSS__INLINE void tss__P_stable(int d, tss__lanes *TSS__RESTRICT F, tss__lanes *TSS__RESTRICT C,
+                               const tss__strain *s, const double *J, const double *mu,
+                               const double *lambda, tss__lanes *TSS__RESTRICT P) {
     tss__lanes a, b;
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double gap, j = tss__J_minus_1(s->tr[l], s->rest[l], s->delta2[l], J[l], &gap);
         a[l] = mu[l] * (3 + s->tr[l]) / (4 + s->tr[l]);
         b[l] = lambda[l] * j - 0.75 * mu[l];
     }
-    for (int i = 0; i < d * d; i++) TSS__EACH_LANE(l) P[i][l] = a[l] * F[i][l] + b[l] * C[i][l];
+    for (int i = 0; i < d * d; i++)
+        TSS__EACH_LANE (l) P[i][l] = a[l] * F[i][l] + b[l] * C[i][l];
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -1210,44 +1303,85 @@ TSS__INLINE void tss__P_stable(int d, tss__lanes *TSS__RESTRICT F,
 // F = U Σ Vᵀ of eight 3 × 3 (2 × 2) matrices, U and V rotations (det +1), |sigma_1| >= |sigma_2| >=
 // |sigma_3|, only the last may be negative. One-sided Jacobi: columns of A = FV are made orthogonal
 // by plane rotations of F itself, so small singular values have error eps·‖F‖, not √eps·‖F‖ as from
-// FᵀF. A pair whose cosine is below 1e-15 is left alone, bit for bit: extra sweeps that other
-// lanes need do not change a converged one. 4 to 5 sweeps.
+// FᵀF. A lane that has converged is left alone, bit for bit, in the sweeps that others still need.
+// 4 to 5 sweeps.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__JACOBI_COS2 1e-30  // (cosine 1e-15)²: a few roundings of a dot product
-#define TSS__JACOBI_SWEEPS 10   // never seen above 6
+#define TSS__JACOBI_LAST 1e-14  // (cosine 1e-7)² and (angle 1e-8)² of a sweep that needs no other:
+#define TSS__JACOBI_ANGLE2 1e-16  // what it leaves is their product
+#define TSS__JACOBI_SWEEPS 10     // never seen above 6
 
-// One rotation of columns p and q of A and V; marks lanes that turned.
-TSS__INLINE void tss__jacobi_columns(int d, int p, int q, tss__lanes *TSS__RESTRICT A,
-                                     tss__lanes *TSS__RESTRICT V, double *TSS__RESTRICT turned) {
-    tss__lanes c, s;
-    TSS__EACH_LANE(l) {
-        double a = A[p][l] * A[p][l] + A[d + p][l] * A[d + p][l];
-        double b = A[q][l] * A[q][l] + A[d + q][l] * A[d + q][l];
-        double g = A[p][l] * A[q][l] + A[d + p][l] * A[d + q][l];
-        if (d == 3) {
-            a += A[6 + p][l] * A[6 + p][l];
-            b += A[6 + q][l] * A[6 + q][l];
-            g += A[6 + p][l] * A[6 + q][l];
-        }
-        // tan of the smaller angle that makes the columns orthogonal; 1e-300 keeps 0/0 away.
-        double h = b - a, g2 = 2 * g, n = h * h + g2 * g2;
-        double t = g2 / ((h < 0 ? -h : h) + n * tss__rsqrt3(n) + 1e-300);
-        t = h < 0 ? -t : t;
-        double cc = tss__rsqrt(1 + t * t), ss = cc * t;
-        int turn = g * g > TSS__JACOBI_COS2 * a * b;
-        c[l] = turn ? cc : 1.0;
-        s[l] = turn ? ss : 0.0;
-        turned[l] = turn ? 1.0 : turned[l];
-    }
-    for (int r = 0; r < d; r++) {
-        double *ap = A[r * d + p], *aq = A[r * d + q], *vp = V[r * d + p], *vq = V[r * d + q];
-        TSS__EACH_LANE(l) {
-            double x = ap[l], y = aq[l], z = vp[l], w = vq[l];
-            ap[l] = c[l] * x - s[l] * y, aq[l] = s[l] * x + c[l] * y;
-            vp[l] = c[l] * z - s[l] * w, vq[l] = s[l] * z + c[l] * w;
+#define TSS__SVD_TILES 4
+
+// Columns of some tiles turned by Jacobi rotations. A rotation is a long chain of dependent
+// operations, so each phase of it is done for all tiles: several chains run side by side.
+typedef struct tss__jacobi {
+    TSS__ALIGN tss__lanes A[TSS__SVD_TILES][9];
+    TSS__ALIGN tss__lanes V[TSS__SVD_TILES][9];
+    TSS__ALIGN tss__lanes active[TSS__SVD_TILES], again[TSS__SVD_TILES];  // 1 or 0
+    TSS__ALIGN tss__lanes ab[TSS__SVD_TILES], g[TSS__SVD_TILES], h[TSS__SVD_TILES];
+    TSS__ALIGN tss__lanes c[TSS__SVD_TILES], s[TSS__SVD_TILES];
+} tss__jacobi;
+
+// With squared lengths a, b of the columns and their product g: h = b − a, and
+// tan = 2g/(h ± √(h² + 4g²)) of the smaller angle that makes them orthogonal, into s.
+TSS__INLINE void tss__jacobi_tan(int d, int tiles, int p, int q, tss__jacobi *j) {
+    for (int i = 0; i < tiles; i++) {
+        tss__lanes *A = j->A[i];
+        TSS__EACH_LANE (l) {
+            double x = A[p][l], y = A[q][l], u = A[d + p][l], v = A[d + q][l];
+            double a = x * x + u * u, b = y * y + v * v, g = x * y + u * v;
+            if (d == 3) {
+                x = A[6 + p][l], y = A[6 + q][l];
+                a += x * x, b += y * y, g += x * y;
+            }
+            j->ab[i][l] = a * b, j->g[i][l] = g, j->h[i][l] = b - a;
         }
     }
+    for (int i = 0; i < tiles; i++)
+        TSS__EACH_LANE (l) {
+            double h = j->h[i][l], g2 = 2 * j->g[i][l], n = h * h + g2 * g2;
+            j->s[i][l] = n * tss__rsqrt3(n);
+        }
+    for (int i = 0; i < tiles; i++)
+        TSS__EACH_LANE (l) {
+            // 1e-300 keeps 0/0 away.
+            double h = j->h[i][l], t = 2 * j->g[i][l] / (tss__abs(h) + j->s[i][l] + 1e-300);
+            j->s[i][l] = h < 0 ? -t : t;
+        }
+}
+
+// One rotation of columns p and q in the active lanes; marks those that need another sweep.
+TSS__INLINE void tss__jacobi_turn(int d, int tiles, int p, int q, tss__jacobi *j) {
+    tss__jacobi_tan(d, tiles, p, q, j);
+    for (int i = 0; i < tiles; i++)
+        TSS__EACH_LANE (l) {
+            double t = j->s[i][l], n = 1 + t * t;
+            j->c[i][l] = tss__rsqrt(n);
+        }
+    for (int i = 0; i < tiles; i++)
+        TSS__EACH_LANE (l) {
+            double t = j->s[i][l], cc = j->c[i][l], gg = j->g[i][l] * j->g[i][l], ab = j->ab[i][l];
+            double turn = gg > TSS__JACOBI_COS2 * ab ? j->active[i][l] : 0.0;
+            double steep = t * t > TSS__JACOBI_ANGLE2 ? turn : 0.0;
+            double wide = gg > TSS__JACOBI_LAST * ab ? turn : 0.0, more = j->again[i][l];
+            more = more > steep ? more : steep;
+            j->again[i][l] = more > wide ? more : wide;
+            j->c[i][l] = turn > 0 ? cc : 1.0;
+            j->s[i][l] = turn > 0 ? cc * t : 0.0;
+        }
+    for (int r = 0; r < d; r++)
+        for (int i = 0; i < tiles; i++) {
+            double *ap = j->A[i][r * d + p], *aq = j->A[i][r * d + q];
+            double *vp = j->V[i][r * d + p], *vq = j->V[i][r * d + q];
+            const double *cc = j->c[i], *ss = j->s[i];
+            TSS__EACH_LANE (l) {
+                double x = ap[l], y = aq[l], z = vp[l], w = vq[l], c = cc[l], s = ss[l];
+                ap[l] = c * x - s * y, aq[l] = s * x + c * y;
+                vp[l] = c * z - s * w, vq[l] = s * z + c * w;
+            }
+        }
 }
 
 static int tss__any(const double *flag) {
@@ -1259,7 +1393,7 @@ static int tss__any(const double *flag) {
 TSS__INLINE void tss__identity(int d, tss__lanes *V) {
     for (int i = 0; i < d * d; i++) {
         const double v = i % (d + 1) ? 0.0 : 1.0;
-        TSS__EACH_LANE(l) V[i][l] = v;
+        TSS__EACH_LANE (l) V[i][l] = v;
     }
 }
 
@@ -1267,7 +1401,7 @@ TSS__INLINE void tss__identity(int d, tss__lanes *V) {
 TSS__INLINE void tss__order_columns(int d, int p, int q, tss__lanes *TSS__RESTRICT A,
                                     tss__lanes *TSS__RESTRICT V) {
     tss__lanes swap;
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double a = A[p][l] * A[p][l] + A[d + p][l] * A[d + p][l];
         double b = A[q][l] * A[q][l] + A[d + q][l] * A[d + q][l];
         if (d == 3) a += A[6 + p][l] * A[6 + p][l], b += A[6 + q][l] * A[6 + q][l];
@@ -1275,7 +1409,7 @@ TSS__INLINE void tss__order_columns(int d, int p, int q, tss__lanes *TSS__RESTRI
     }
     for (int r = 0; r < d; r++) {
         double *ap = A[r * d + p], *aq = A[r * d + q], *vp = V[r * d + p], *vq = V[r * d + q];
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             double x = ap[l], y = aq[l], z = vp[l], w = vq[l];
             int turn = swap[l] > 0;
             ap[l] = turn ? y : x, aq[l] = turn ? -x : y;
@@ -1288,7 +1422,7 @@ TSS__INLINE void tss__order_columns(int d, int p, int q, tss__lanes *TSS__RESTRI
 // (Duff et al. 2017). The last column is the cross product: det U = +1, sigma takes the sign.
 TSS__INLINE void tss__svd_left3(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT U,
                                 tss__lanes *TSS__RESTRICT sigma) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double ax = A[0][l], ay = A[3][l], az = A[6][l];
         double bx = A[1][l], by = A[4][l], bz = A[7][l];
         double n = ax * ax + ay * ay + az * az, i = tss__rsqrt(n);
@@ -1314,7 +1448,7 @@ TSS__INLINE void tss__svd_left3(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RE
 
 TSS__INLINE void tss__svd_left2(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT U,
                                 tss__lanes *TSS__RESTRICT sigma) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double ax = A[0][l], ay = A[2][l], n = ax * ax + ay * ay, i = tss__rsqrt(n);
         int ok = n > 1e-290;
         double x = ok ? ax * i : 1.0, y = ok ? ay * i : 0.0;
@@ -1325,48 +1459,83 @@ TSS__INLINE void tss__svd_left2(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RE
     }
 }
 
-TSS__INLINE void tss__svd_in(int d, tss__lanes *F, tss__lanes *U, tss__lanes *sigma,
-                          tss__lanes *V) {
-    TSS__ALIGN tss__lanes A[9];
-    TSS__ALIGN tss__lanes turned;
-    memcpy(A, F, (size_t)(d * d) * sizeof *A);
-    tss__identity(d, V);
+typedef struct tss__svd_parts {
+    tss__lanes U[9], V[9], sigma[3];
+} tss__svd_parts;
+
+// Sweeps until every lane has converged.
+TSS__INLINE void tss__jacobi_sweeps(int d, int tiles, tss__jacobi *j) {
+    for (int i = 0; i < tiles; i++)
+        TSS__EACH_LANE (l) j->active[i][l] = 1;
     for (int k = 0; k < TSS__JACOBI_SWEEPS; k++) {
-        TSS__EACH_LANE(l) turned[l] = 0;
-        tss__jacobi_columns(d, 0, 1, A, V, turned);
-        if (d == 3) tss__jacobi_columns(d, 0, 2, A, V, turned);
-        if (d == 3) tss__jacobi_columns(d, 1, 2, A, V, turned);
-        if (!tss__any(turned)) break;
+        int left = 0;
+        for (int i = 0; i < tiles; i++)
+            TSS__EACH_LANE (l) j->again[i][l] = 0;
+        tss__jacobi_turn(d, tiles, 0, 1, j);
+        if (d == 3) tss__jacobi_turn(d, tiles, 0, 2, j);
+        if (d == 3) tss__jacobi_turn(d, tiles, 1, 2, j);
+        for (int i = 0; i < tiles; i++) left |= tss__any(j->again[i]);
+        if (!left) break;
+        memcpy(j->active, j->again, sizeof j->active);
     }
-    tss__order_columns(d, 0, 1, A, V);
-    if (d == 3) tss__order_columns(d, 0, 2, A, V);
-    if (d == 3) tss__order_columns(d, 1, 2, A, V);
-    if (d == 3) tss__svd_left3(A, U, sigma);
-    else tss__svd_left2(A, U, sigma);
 }
 
-// sigma[2] = 1 in 2D: the stretch out of the plane.
-TSS__STAGE void tss__svd(int d, tss__lanes *F, tss__lanes *U, tss__lanes *sigma, tss__lanes *V) {
-    if (d == 3) tss__svd_in(3, F, U, sigma, V);
-    else tss__svd_in(2, F, U, sigma, V);
+TSS__STAGE void tss__jacobi_run(int d, int tiles, tss__jacobi *j) {
+    if (d == 2)
+        tss__jacobi_sweeps(2, tiles, j);
+    else if (tiles == TSS__SVD_TILES)
+        tss__jacobi_sweeps(3, TSS__SVD_TILES, j);
+    else
+        tss__jacobi_sweeps(3, tiles, j);
+}
+
+TSS__INLINE void tss__svd_finish(int d, tss__lanes *A, tss__svd_parts *o) {
+    tss__order_columns(d, 0, 1, A, o->V);
+    if (d == 3) tss__order_columns(d, 0, 2, A, o->V);
+    if (d == 3) tss__order_columns(d, 1, 2, A, o->V);
+    if (d == 3)
+        tss__svd_left3(A, o->U, o->sigma);
+    else
+        tss__svd_left2(A, o->U, o->sigma);
+}
+
+// Of 1..TSS__SVD_TILES tiles. sigma[2] = 1 in 2D: the stretch out of the plane.
+TSS__STAGE void tss__svd(int d, int tiles, tss__lanes *const *F, tss__svd_parts *const *o) {
+    tss__jacobi j;
+    for (int i = 0; i < tiles; i++) {
+        memcpy(j.A[i], F[i], (size_t)(d * d) * sizeof(tss__lanes));
+        tss__identity(d, j.V[i]);
+    }
+    tss__jacobi_run(d, tiles, &j);
+    for (int i = 0; i < tiles; i++) {
+        memcpy(o[i]->V, j.V[i], (size_t)(d * d) * sizeof(tss__lanes));
+        if (d == 3)
+            tss__svd_finish(3, j.A[i], o[i]);
+        else
+            tss__svd_finish(2, j.A[i], o[i]);
+    }
+}
+
+TSS__INLINE void tss__svd_one(int d, tss__lanes *F, tss__svd_parts *o) {
+    tss__lanes *f[1] = {F};
+    tss__svd_parts *p[1] = {o};
+    tss__svd(d, 1, f, p);
 }
 
 TSS__INLINE void tss__psi_corotated(tss__lanes *TSS__RESTRICT sigma, const double *J,
                                     const double *mu, const double *lambda,
                                     double *TSS__RESTRICT psi) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double a = sigma[0][l] - 1, b = sigma[1][l] - 1, c = sigma[2][l] - 1, j = J[l] - 1;
         psi[l] = mu[l] * (a * a + b * b + c * c) + 0.5 * lambda[l] * (j * j);
     }
 }
 
-TSS__INLINE void tss__P_corotated(int d, tss__lanes *TSS__RESTRICT F,
-                                  tss__lanes *TSS__RESTRICT C,
-                                  tss__lanes *TSS__RESTRICT R, const double *J,
-                                  const double *mu, const double *lambda,
-                                  tss__lanes *TSS__RESTRICT P) {
+TSS__INLINE void tss__P_corotated(int d, tss__lanes *TSS__RESTRICT F, tss__lanes *TSS__RESTRICT C,
+                                  tss__lanes *TSS__RESTRICT R, const double *J, const double *mu,
+                                  const double *lambda, tss__lanes *TSS__RESTRICT P) {
     for (int i = 0; i < d * d; i++)
-        TSS__EACH_LANE(l)
+        TSS__EACH_LANE (l)
             P[i][l] = 2 * mu[l] * (F[i][l] - R[i][l]) + lambda[l] * (J[l] - 1) * C[i][l];
 }
 
@@ -1377,23 +1546,24 @@ TSS__INLINE void tss__P_corotated(int d, tss__lanes *TSS__RESTRICT F,
 //     flip  = (psi_a − psi_b)/(sigma_a − sigma_b)   for G_ab =  G_ba,
 //     twist = (psi_a + psi_b)/(sigma_a + sigma_b)   for G_ab = −G_ba,
 // psi_a = ∂psi/∂sigma_a. Both quotients are divided out by hand, so equal stretches are no special
-// case. The nearest PSD matrix clamps S, flip and twist at 0. With c = mu − lambda ln J, third index
-// k, w_k = product of the other two stretches, s = Σ sigma² − 3:
-//                S_aa                            S_ab                       flip, twist
-//   NH           mu + c/a² + lambda/a²           lambda/(ab)                mu ± c/(ab)
-//   stable NH    m(3+s)/(4+s) + 2ma²/(4+s)²      2mab/(4+s)² + l w_a w_b    m(3+s)/(4+s) ∓ t k
-//                + l w_a²                        + t k,  t = l j − 3m/4
-//   StVK         mu(3a² − 1) + lambda(s/2 + a²)  lambda a b                 mu(a² ± ab + b² − 1) + lambda s/2
-//   fixed cor.   2mu + lambda w_a²               lambda(w_a w_b + j k)      2mu − lambda j k,
-//                                                                           2mu − 4mu/(a + b) + lambda j k
-//   linear       2mu + lambda                    lambda                     2mu, 0   (U = V = I)
+// case. The nearest PSD matrix clamps S, flip and twist at 0. Below a, b are the two stretches of
+// an entry, k the third, w_a the product of all but a; c = mu − lambda ln J, j = J − 1, s = Σ
+// sigma² − 3, t = l j − 3m/4, p = m (3 + s)/(4 + s), q = 2m/(4 + s)².
+//                S_aa                             S_ab                     flip, twist
+//   NH           mu + (c + lambda)/a²             lambda/(ab)              mu ± c/(ab)
+//   stable NH    p + q a² + l w_a²                q ab + l w_a w_b + t k   p ∓ t k
+//   StVK         mu (3a² − 1) + lambda (s/2 + a²) lambda ab                mu (a² ± ab + b² − 1)
+//                                                                          + lambda s/2
+//   fixed cor.   2mu + lambda w_a²                lambda (w_a w_b + j k)   2mu − lambda j k,
+//                                                          2mu − 4mu/(a + b) + lambda j k
+//   linear       2mu + lambda                     lambda                   2mu, 0  (U = V = I)
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss__stretch {
-    tss__lanes U[9], V[9], sigma[3];
-    tss__lanes S[6];     // 00 11 22 12 02 01
-    tss__lanes flip[3];  // pairs 12 02 01; later (flip + twist)/2: G_ab with itself
-    tss__lanes twist[3]; // later (flip − twist)/2: G_ab with G_ba
+    tss__svd_parts f;
+    tss__lanes S[6];      // 00 11 22 12 02 01
+    tss__lanes flip[3];   // pairs 12 02 01; later (flip + twist)/2: G_ab with itself
+    tss__lanes twist[3];  // later (flip − twist)/2: G_ab with G_ba
 } tss__stretch;
 
 // Index of the two stretches of a pair, and of the third.
@@ -1403,11 +1573,11 @@ TSS__INLINE int tss__pair_b(int k) { return k == 2 ? 1 : 2; }
 TSS__INLINE void tss__stretch_neo_hookean(const double *J, const double *mu, const double *lambda,
                                           tss__stretch *TSS__RESTRICT h) {
     tss__lanes c;
-    TSS__EACH_LANE(l) c[l] = mu[l] - lambda[l] * tss__log(J[l]);
+    TSS__EACH_LANE (l) c[l] = mu[l] - lambda[l] * tss__log(J[l]);
     for (int k = 0; k < 3; k++) {
-        const double *a = h->sigma[tss__pair_a(k)], *b = h->sigma[tss__pair_b(k)];
-        const double *s = h->sigma[k];
-        TSS__EACH_LANE(l) {
+        const double *a = h->f.sigma[tss__pair_a(k)], *b = h->f.sigma[tss__pair_b(k)];
+        const double *s = h->f.sigma[k];
+        TSS__EACH_LANE (l) {
             double i = 1 / (a[l] * b[l]), n = 1 / (s[l] * s[l]);
             h->S[k][l] = mu[l] + (c[l] + lambda[l]) * n;
             h->S[3 + k][l] = lambda[l] * i;
@@ -1420,16 +1590,16 @@ TSS__INLINE void tss__stretch_neo_hookean(const double *J, const double *mu, con
 TSS__INLINE void tss__stretch_stable(const double *J, const double *mu, const double *lambda,
                                      tss__stretch *TSS__RESTRICT h) {
     tss__lanes n, p, t;
-    TSS__EACH_LANE(l) {
-        double a = h->sigma[0][l], b = h->sigma[1][l], c = h->sigma[2][l];
+    TSS__EACH_LANE (l) {
+        double a = h->f.sigma[0][l], b = h->f.sigma[1][l], c = h->f.sigma[2][l];
         n[l] = 1 / (1 + (a * a + b * b + c * c));
         p[l] = mu[l] * (1 - n[l]);
         t[l] = lambda[l] * (J[l] - 1) - 0.75 * mu[l];
     }
     for (int k = 0; k < 3; k++) {
-        const double *a = h->sigma[tss__pair_a(k)], *b = h->sigma[tss__pair_b(k)];
-        const double *s = h->sigma[k];
-        TSS__EACH_LANE(l) {
+        const double *a = h->f.sigma[tss__pair_a(k)], *b = h->f.sigma[tss__pair_b(k)];
+        const double *s = h->f.sigma[k];
+        TSS__EACH_LANE (l) {
             double m = 2 * mu[l] * (n[l] * n[l]), ab = a[l] * b[l], tk = t[l] * s[l];
             h->S[k][l] = p[l] + m * (s[l] * s[l]) + lambda[l] * (ab * ab);
             h->S[3 + k][l] = m * ab + lambda[l] * (s[l] * s[l]) * ab + tk;
@@ -1442,14 +1612,14 @@ TSS__INLINE void tss__stretch_stable(const double *J, const double *mu, const do
 TSS__INLINE void tss__stretch_stvk(const double *mu, const double *lambda,
                                    tss__stretch *TSS__RESTRICT h) {
     tss__lanes half;
-    TSS__EACH_LANE(l) {
-        double a = h->sigma[0][l], b = h->sigma[1][l], c = h->sigma[2][l];
+    TSS__EACH_LANE (l) {
+        double a = h->f.sigma[0][l], b = h->f.sigma[1][l], c = h->f.sigma[2][l];
         half[l] = 0.5 * lambda[l] * (a * a + b * b + c * c - 3);
     }
     for (int k = 0; k < 3; k++) {
-        const double *a = h->sigma[tss__pair_a(k)], *b = h->sigma[tss__pair_b(k)];
-        const double *s = h->sigma[k];
-        TSS__EACH_LANE(l) {
+        const double *a = h->f.sigma[tss__pair_a(k)], *b = h->f.sigma[tss__pair_b(k)];
+        const double *s = h->f.sigma[k];
+        TSS__EACH_LANE (l) {
             double q = a[l] * a[l] + b[l] * b[l] - 1, ab = a[l] * b[l], s2 = s[l] * s[l];
             h->S[k][l] = mu[l] * (3 * s2 - 1) + half[l] + lambda[l] * s2;
             h->S[3 + k][l] = lambda[l] * ab;
@@ -1462,10 +1632,10 @@ TSS__INLINE void tss__stretch_stvk(const double *mu, const double *lambda,
 TSS__INLINE void tss__stretch_corotated(const double *J, const double *mu, const double *lambda,
                                         tss__stretch *TSS__RESTRICT h) {
     for (int k = 0; k < 3; k++) {
-        const double *a = h->sigma[tss__pair_a(k)], *b = h->sigma[tss__pair_b(k)];
-        const double *s = h->sigma[k];
-        TSS__EACH_LANE(l) {
-            // a + b >= 0 by the order of sigma; at 0 the rotation R is not unique and twist is −inf.
+        const double *a = h->f.sigma[tss__pair_a(k)], *b = h->f.sigma[tss__pair_b(k)];
+        const double *s = h->f.sigma[k];
+        TSS__EACH_LANE (l) {
+            // a + b >= 0 by the order of sigma; at 0 R is not unique and twist is −inf.
             double ab = a[l] * b[l], sum = a[l] + b[l], jk = lambda[l] * (J[l] - 1) * s[l];
             sum = sum > 1e-12 ? sum : 1e-12;
             h->S[k][l] = 2 * mu[l] + lambda[l] * (ab * ab);
@@ -1478,10 +1648,10 @@ TSS__INLINE void tss__stretch_corotated(const double *J, const double *mu, const
 
 TSS__INLINE void tss__stretch_linear(int d, const double *mu, const double *lambda,
                                      tss__stretch *TSS__RESTRICT h) {
-    tss__identity(d, h->U);
-    tss__identity(d, h->V);
+    tss__identity(d, h->f.U);
+    tss__identity(d, h->f.V);
     for (int k = 0; k < 3; k++)
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             h->S[k][l] = 2 * mu[l] + lambda[l];
             h->S[3 + k][l] = lambda[l];
             h->flip[k][l] = 2 * mu[l];
@@ -1493,7 +1663,7 @@ TSS__INLINE void tss__stretch_linear(int d, const double *mu, const double *lamb
 TSS__INLINE void tss__jacobi_sym(int p, int q, int r, tss__lanes *TSS__RESTRICT S,
                                  tss__lanes *TSS__RESTRICT Q) {
     double *pp = S[p], *qq = S[q], *pq = S[3 + r], *pr = S[3 + q], *qr = S[3 + p];
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double h = qq[l] - pp[l], g = 2 * pq[l], n = h * h + g * g;
         double t = g / ((h < 0 ? -h : h) + n * tss__rsqrt(n) + 1e-300);
         t = h < 0 ? -t : t;
@@ -1511,7 +1681,7 @@ TSS__INLINE void tss__jacobi_sym(int p, int q, int r, tss__lanes *TSS__RESTRICT 
 // minor is negative). 3 × 3 Jacobi is at rounding after 5 sweeps.
 TSS__STAGE void tss__clamp_stretch(tss__lanes *TSS__RESTRICT S) {
     TSS__ALIGN tss__lanes bad;
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double a = S[0][l], b = S[1][l], c = S[2][l], x = S[3][l], y = S[4][l], z = S[5][l];
         double m0 = b * c - x * x, m1 = a * c - y * y, m2 = a * b - z * z;
         double det = a * m0 - z * (z * c - x * y) + y * (z * x - b * y);
@@ -1528,11 +1698,13 @@ TSS__STAGE void tss__clamp_stretch(tss__lanes *TSS__RESTRICT S) {
         tss__jacobi_sym(0, 2, 1, T, Q);
         tss__jacobi_sym(1, 2, 0, T, Q);
     }
-    for (int k = 0; k < 3; k++) TSS__EACH_LANE(l) T[k][l] = T[k][l] > 0 ? T[k][l] : 0;
+    for (int k = 0; k < 3; k++)
+        TSS__EACH_LANE (l) T[k][l] = T[k][l] > 0 ? T[k][l] : 0;
     for (int k = 0; k < 6; k++) {
         const int a = k < 3 ? k : tss__pair_a(k - 3), b = k < 3 ? k : tss__pair_b(k - 3);
-        TSS__EACH_LANE(l) {
-            double v = T[0][l] * Q[a * 3][l] * Q[b * 3][l] + T[1][l] * Q[a * 3 + 1][l] * Q[b * 3 + 1][l] +
+        TSS__EACH_LANE (l) {
+            double v = T[0][l] * Q[a * 3][l] * Q[b * 3][l] +
+                       T[1][l] * Q[a * 3 + 1][l] * Q[b * 3 + 1][l] +
                        T[2][l] * Q[a * 3 + 2][l] * Q[b * 3 + 2][l];
             S[k][l] = bad[l] > 0 ? v : S[k][l];
         }
@@ -1543,11 +1715,13 @@ TSS__STAGE void tss__clamp_stretch(tss__lanes *TSS__RESTRICT S) {
 TSS__INLINE void tss__stretch_finish(int d, int psd, const double *vol,
                                      tss__stretch *TSS__RESTRICT h) {
     // In 2D the third stretch does not vary: give it a harmless block of its own.
-    if (d == 2) TSS__EACH_LANE(l) h->S[2][l] = 1, h->S[3][l] = 0, h->S[4][l] = 0;
+    if (d == 2)
+        TSS__EACH_LANE (l) h->S[2][l] = 1, h->S[3][l] = 0, h->S[4][l] = 0;
     if (psd) tss__clamp_stretch(h->S);
-    for (int k = 0; k < 6; k++) TSS__EACH_LANE(l) h->S[k][l] *= vol[l];
+    for (int k = 0; k < 6; k++)
+        TSS__EACH_LANE (l) h->S[k][l] *= vol[l];
     for (int k = 0; k < 3; k++)
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             double f = h->flip[k][l], t = h->twist[k][l];
             f = psd && f < 0 ? 0 : f;
             t = psd && t < 0 ? 0 : t;
@@ -1562,9 +1736,10 @@ TSS__INLINE void tss__stretch_finish(int d, int psd, const double *vol,
 // the rows of Dm⁻¹ are the gradients of the shape functions of nodes 1..d. Per cell d² + 1 numbers
 // (and mu, lambda where they differ by cell) in blocks of eight; a range that starts at a multiple
 // of 8 reads them in place, any other list of ids copies them lane by lane into the same kernels,
-// so both give the same bits. A cell in 3D costs about 280 flops for a gradient, 230 for a value,
-// 2,000 for a projected Hessian. The node blocks of the Hessian are H_ij = U Ĥ_ij Uᵀ, Ĥ_ij built
-// from b̂ = Vᵀ∇N:   Ĥ_ij,aa = S_aa b̂_ia b̂_ja + Σ_m≠a A_am b̂_im b̂_jm,
+// so both give the same bits. A cell in 3D costs about 190 flops for a value, 320 for a gradient,
+// 2,700 for a projected Hessian, of which 1,500 are the SVD. The node blocks of the Hessian are
+// H_ij = U Ĥ_ij Uᵀ, Ĥ_ij built from b̂ = Vᵀ∇N:
+//                  Ĥ_ij,aa = S_aa b̂_ia b̂_ja + Σ_m≠a A_am b̂_im b̂_jm,
 //                  Ĥ_ij,ab = S_ab b̂_ia b̂_jb + B_ab b̂_ib b̂_ja,   A, B = (flip ± twist)/2.
 // ---------------------------------------------------------------------------------------------
 
@@ -1572,12 +1747,12 @@ typedef struct tss__elastic {
     int dim, cells, blocks;  // blocks of TSS_LANES cells, the last one filled up with its last cell
     int per_cell;            // mu and lambda have one entry a cell
     tss_material material;
-    int *node;               // cells × (d + 1)
-    const int *label;        // the caller's cell numbers for messages, or NULL
-    tss__lanes *inv;         // blocks × d²: Dm⁻¹, row k = ∇N of node k + 1
-    tss__lanes *vol;         // blocks
-    tss__lanes *mu, *lambda; // blocks, or 1 when all cells share them; m and l for the stable NH
-    double *limit;           // max_step, min J: results of the tasks
+    int *node;                // cells × (d + 1)
+    const int *label;         // the caller's cell numbers for messages, or NULL
+    tss__lanes *inv;          // blocks × d²: Dm⁻¹, row k = ∇N of node k + 1
+    tss__lanes *vol;          // blocks
+    tss__lanes *mu, *lambda;  // blocks, or 1 when all cells share them; m and l for the stable NH
+    double *limit;            // max_step, min J: results of the tasks
     int *culprit;
 } tss__elastic;
 
@@ -1640,13 +1815,13 @@ TSS__INLINE void tss__tile_F_in(int d, const tss__elastic *e, const double *x, t
     tss__tile_edges(d, e->node, x, t->id, t->D);
     for (int r = 0; r < d; r++) {
         if (d == 2) {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a = D[r][l], b = D[2 + r][l];
                 F[r * 2][l] = a * B[0][l] + b * B[2][l];
                 F[r * 2 + 1][l] = a * B[1][l] + b * B[3][l];
             }
         } else {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a = D[r][l], b = D[3 + r][l], c = D[6 + r][l];
                 F[r * 3][l] = a * B[0][l] + b * B[3][l] + c * B[6][l];
                 F[r * 3 + 1][l] = a * B[1][l] + b * B[4][l] + c * B[7][l];
@@ -1657,8 +1832,10 @@ TSS__INLINE void tss__tile_F_in(int d, const tss__elastic *e, const double *x, t
 }
 
 TSS__STAGE void tss__tile_F(int d, const tss__elastic *e, const double *x, tss__tile *t) {
-    if (d == 3) tss__tile_F_in(3, e, x, t);
-    else tss__tile_F_in(2, e, x, t);
+    if (d == 3)
+        tss__tile_F_in(3, e, x, t);
+    else
+        tss__tile_F_in(2, e, x, t);
 }
 
 // Volume × psi of a tile, from F.
@@ -1666,7 +1843,7 @@ TSS__INLINE void tss__tile_psi(int d, tss_material_kind kind, tss__tile *t, doub
     TSS__ALIGN tss__lanes C[9];
     TSS__ALIGN tss__lanes J;
     TSS__ALIGN tss__strain s;
-    TSS__ALIGN tss__stretch h;
+    TSS__ALIGN tss__svd_parts f;
     tss__cofactor(d, t->F, C, J);
     if (kind != TSS_LINEAR && kind != TSS_FIXED_COROTATED) tss__strain_of(d, t->F, &s);
     if (kind == TSS_NEO_HOOKEAN) tss__psi_neo_hookean(&s, J, t->mu, t->lambda, psi);
@@ -1674,10 +1851,10 @@ TSS__INLINE void tss__tile_psi(int d, tss_material_kind kind, tss__tile *t, doub
     if (kind == TSS_STVK) tss__psi_stvk(&s, t->mu, t->lambda, psi);
     if (kind == TSS_LINEAR) tss__psi_linear(d, t->F, t->mu, t->lambda, psi);
     if (kind == TSS_FIXED_COROTATED) {
-        tss__svd(d, t->F, h.U, h.sigma, h.V);
-        tss__psi_corotated(h.sigma, J, t->mu, t->lambda, psi);
+        tss__svd_one(d, t->F, &f);
+        tss__psi_corotated(f.sigma, J, t->mu, t->lambda, psi);
     }
-    TSS__EACH_LANE(l) psi[l] *= t->vol[l];
+    TSS__EACH_LANE (l) psi[l] *= t->vol[l];
 }
 
 TSS__INLINE void tss__tile_P(int d, tss_material_kind kind, tss__tile *t, tss__lanes *P) {
@@ -1685,7 +1862,7 @@ TSS__INLINE void tss__tile_P(int d, tss_material_kind kind, tss__tile *t, tss__l
     TSS__ALIGN tss__lanes S[6];
     TSS__ALIGN tss__lanes J;
     TSS__ALIGN tss__strain s;
-    TSS__ALIGN tss__stretch h;
+    TSS__ALIGN tss__svd_parts f;
     tss__cofactor(d, t->F, C, J);
     if (kind != TSS_LINEAR && kind != TSS_FIXED_COROTATED) tss__strain_of(d, t->F, &s);
     if (kind == TSS_NEO_HOOKEAN) {
@@ -1696,22 +1873,28 @@ TSS__INLINE void tss__tile_P(int d, tss_material_kind kind, tss__tile *t, tss__l
         tss__S_stvk(d, &s, t->mu, t->lambda, S);
         tss__mul_sym(d, t->F, S, P);
     }
-    if (kind == TSS_STABLE_NEO_HOOKEAN)
-        tss__P_stable(d, t->F, C, &s, J, t->mu, t->lambda, P);
+    if (kind == TSS_STABLE_NEO_HOOKEAN) tss__P_stable(d, t->F, C, &s, J, t->mu, t->lambda, P);
     if (kind == TSS_LINEAR) tss__P_linear(d, t->F, t->mu, t->lambda, P);
     if (kind == TSS_FIXED_COROTATED) {
         TSS__ALIGN tss__lanes R[9];
-        tss__svd(d, t->F, h.U, h.sigma, h.V);
-        tss__mul(d, h.U, h.V, 1, R);
+        tss__svd_one(d, t->F, &f);
+        tss__mul(d, f.U, f.V, 1, R);
         tss__P_corotated(d, t->F, C, R, J, t->mu, t->lambda, P);
     }
 }
 
-// out[l·n + i] = W[i][l]
-TSS__INLINE void tss__tile_scatter(int n, int used, tss__lanes *TSS__RESTRICT W,
-                                   double *TSS__RESTRICT out) {
-    for (int l = 0; l < used; l++)
-        for (int i = 0; i < n; i++) out[(size_t)(l * n + i)] = W[i][l];
+// out[l·n + i] = W[i][l], two by two: four loads and stores become two of twice the width.
+TSS__STAGE void tss__tile_scatter(int n, int used, tss__lanes *TSS__RESTRICT W,
+                                  double *TSS__RESTRICT out) {
+    int i = 0;
+    for (; used == TSS_LANES && i + 1 < n; i += 2)
+        for (int l = 0; l < TSS_LANES; l += 2) {
+            double *o = out + l * n + i;
+            const double a = W[i][l], b = W[i][l + 1], c = W[i + 1][l], e = W[i + 1][l + 1];
+            o[0] = a, o[1] = c, o[n] = b, o[n + 1] = e;
+        }
+    for (; i < n; i++)
+        for (int l = 0; l < used; l++) out[l * n + i] = W[i][l];
 }
 
 // Rows of the gradient: volume · P ∇N for nodes 1..d, minus their sum for node 0.
@@ -1721,13 +1904,13 @@ TSS__INLINE void tss__tile_forces(int d, tss__tile *t, tss__lanes *TSS__RESTRICT
     const double *TSS__RESTRICT vol = t->vol;
     for (int r = 0; r < d; r++) {
         if (d == 2) {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a = P[r * 2][l] * vol[l], b = P[r * 2 + 1][l] * vol[l];
                 double g1 = a * B[0][l] + b * B[1][l], g2 = a * B[2][l] + b * B[3][l];
                 G[r][l] = -(g1 + g2), G[2 + r][l] = g1, G[4 + r][l] = g2;
             }
         } else {
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a = P[r * 3][l] * vol[l], b = P[r * 3 + 1][l] * vol[l];
                 double c = P[r * 3 + 2][l] * vol[l];
                 double g1 = a * B[0][l] + b * B[1][l] + c * B[2][l];
@@ -1739,16 +1922,14 @@ TSS__INLINE void tss__tile_forces(int d, tss__tile *t, tss__lanes *TSS__RESTRICT
     }
 }
 
-// ∂²psi/∂F² in the principal frame.
+// ∂²psi/∂F² in the principal frame, U, sigma, V being there already.
 TSS__STAGE void tss__tile_stretch(int d, tss_material_kind kind, int psd, tss__tile *t,
-                                   tss__stretch *h) {
+                                  tss__stretch *h) {
     TSS__ALIGN tss__lanes J;
-    if (kind == TSS_LINEAR) {
+    if (kind == TSS_LINEAR)
         tss__stretch_linear(d, t->mu, t->lambda, h);
-    } else {
-        tss__svd(d, t->F, h->U, h->sigma, h->V);
-        TSS__EACH_LANE(l) J[l] = h->sigma[0][l] * h->sigma[1][l] * h->sigma[2][l];
-    }
+    else
+        TSS__EACH_LANE (l) J[l] = h->f.sigma[0][l] * h->f.sigma[1][l] * h->f.sigma[2][l];
     if (kind == TSS_NEO_HOOKEAN) tss__stretch_neo_hookean(J, t->mu, t->lambda, h);
     if (kind == TSS_STABLE_NEO_HOOKEAN) tss__stretch_stable(J, t->mu, t->lambda, h);
     if (kind == TSS_STVK) tss__stretch_stvk(t->mu, t->lambda, h);
@@ -1756,14 +1937,31 @@ TSS__STAGE void tss__tile_stretch(int d, tss_material_kind kind, int psd, tss__t
     tss__stretch_finish(d, psd, t->vol, h);
 }
 
-// U Ĥ_ij Uᵀ for the nodes with rotated shape gradients b and c: nine lanes, row-major.
-TSS__STAGE void tss__node_block3(tss__stretch *TSS__RESTRICT h,
-                                  tss__lanes *TSS__RESTRICT b,
-                                  tss__lanes *TSS__RESTRICT c, tss__lanes *TSS__RESTRICT H) {
+// Cells at.. of the list, up to TSS__SVD_TILES tiles of them, with their stretch Hessians; the
+// number of tiles.
+static int tss__some_tiles(const tss__elastic *e, const double *x, const tss_ids *ids, int at,
+                           int psd, tss__tile *t, tss__stretch *h) {
+    const int all = (ids->count - at + TSS_LANES - 1) / TSS_LANES;
+    const int tiles = all < TSS__SVD_TILES ? all : TSS__SVD_TILES;
+    tss__lanes *F[TSS__SVD_TILES] = {NULL};
+    tss__svd_parts *parts[TSS__SVD_TILES] = {NULL};
+    for (int g = 0; g < tiles; g++) {
+        tss__tile_cells(e, ids, at + g * TSS_LANES, t + g);
+        tss__tile_F(e->dim, e, x, t + g);
+        F[g] = t[g].F, parts[g] = &h[g].f;
+    }
+    if (e->material.kind != TSS_LINEAR) tss__svd(e->dim, tiles, F, parts);
+    for (int g = 0; g < tiles; g++) tss__tile_stretch(e->dim, e->material.kind, psd, t + g, h + g);
+    return tiles;
+}
+
+// U Ĥ_ij Uᵀ for the nodes with rotated shape gradients b and c, into rows of n lanes.
+TSS__STAGE void tss__node_block3(tss__stretch *TSS__RESTRICT h, tss__lanes *TSS__RESTRICT b,
+                                 tss__lanes *TSS__RESTRICT c, int n, tss__lanes *TSS__RESTRICT H) {
     TSS__ALIGN tss__lanes K[9];
     TSS__ALIGN tss__lanes T[9];
     tss__lanes *S = h->S, *A = h->flip, *B = h->twist;
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double b0 = b[0][l], b1 = b[1][l], b2 = b[2][l], c0 = c[0][l], c1 = c[1][l], c2 = c[2][l];
         double m0 = b0 * c0, m1 = b1 * c1, m2 = b2 * c2;
         K[0][l] = S[0][l] * m0 + A[2][l] * m1 + A[1][l] * m2;
@@ -1776,93 +1974,93 @@ TSS__STAGE void tss__node_block3(tss__stretch *TSS__RESTRICT h,
         K[5][l] = S[3][l] * (b1 * c2) + B[0][l] * (b2 * c1);
         K[7][l] = S[3][l] * (b2 * c1) + B[0][l] * (b1 * c2);
     }
-    tss__mul(3, h->U, K, 0, T);
-    tss__mul(3, T, h->U, 1, H);
+    tss__mul(3, h->f.U, K, 0, T);
+    tss__mul_rows(3, n, T, h->f.U, 1, H);
 }
 
-TSS__STAGE void tss__node_block2(tss__stretch *TSS__RESTRICT h,
-                                  tss__lanes *TSS__RESTRICT b,
-                                  tss__lanes *TSS__RESTRICT c, tss__lanes *TSS__RESTRICT H) {
+TSS__STAGE void tss__node_block2(tss__stretch *TSS__RESTRICT h, tss__lanes *TSS__RESTRICT b,
+                                 tss__lanes *TSS__RESTRICT c, int n, tss__lanes *TSS__RESTRICT H) {
     TSS__ALIGN tss__lanes K[4];
     TSS__ALIGN tss__lanes T[4];
     tss__lanes *S = h->S;
     const double *A = h->flip[2], *B = h->twist[2];
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double b0 = b[0][l], b1 = b[1][l], c0 = c[0][l], c1 = c[1][l];
         K[0][l] = S[0][l] * (b0 * c0) + A[l] * (b1 * c1);
         K[3][l] = S[1][l] * (b1 * c1) + A[l] * (b0 * c0);
         K[1][l] = S[5][l] * (b0 * c1) + B[l] * (b1 * c0);
         K[2][l] = S[5][l] * (b1 * c0) + B[l] * (b0 * c1);
     }
-    tss__mul(2, h->U, K, 0, T);
-    tss__mul(2, T, h->U, 1, H);
+    tss__mul(2, h->f.U, K, 0, T);
+    tss__mul_rows(2, n, T, h->f.U, 1, H);
 }
 
-// H into rows of node i and columns of node j of the upper triangle of n × n W.
-TSS__INLINE void tss__put_block(int d, int n, int i, int j, tss__lanes *H, tss__lanes *W) {
-    for (int r = 0; r < d; r++)
-        for (int c = i == j ? r : 0; c < d; c++)
-            memcpy(W[(i * d + r) * n + j * d + c], H[r * d + c], sizeof *H);
-}
-
-// Node 0 is minus the sum of the others: its blocks from the sums over rows, then over columns.
-TSS__INLINE void tss__first_node(int d, int edges, tss__lanes *TSS__RESTRICT sum, tss__lanes *W) {
-    TSS__ALIGN tss__lanes H[9];
+// Node 0 moves F by minus the sum of the others: H_0j = −Σ_i H_ij, H_00 = −Σ_j H_0j. The blocks
+// (i, j), 1 <= i <= j, are in place; the lower ones are read from their mirror.
+TSS__INLINE void tss__first_node(int d, int edges, tss__lanes *W) {
     const int n = d * (edges + 1);
-    for (int i = 0; i < d * d; i++) TSS__EACH_LANE(l) H[i][l] = 0;
-    for (int j = 0; j < edges; j++)
-        for (int i = 0; i < d * d; i++) {
-            double *s = sum[j * d * d + i], *o = H[i];
-            TSS__EACH_LANE(l) o[l] += s[l], s[l] = -s[l];
+    for (int r = 0; r < d; r++) {
+        for (int c = d; c < n; c++) {
+            const double *p = W[(d + r) * n + c], *q = W[(2 * d + r) * n + c];
+            const double *s = W[(n - d + r) * n + c];
+            double *o = W[r * n + c];
+            if (edges == 3)
+                TSS__EACH_LANE (l) o[l] = -(p[l] + q[l] + s[l]);
+            else
+                TSS__EACH_LANE (l) o[l] = -(p[l] + q[l]);
         }
-    tss__put_block(d, n, 0, 0, H, W);
-    for (int j = 0; j < edges; j++) tss__put_block(d, n, 0, j + 1, sum + j * d * d, W);
+        for (int c = r; c < d; c++) {
+            const double *p = W[r * n + d + c], *q = W[r * n + 2 * d + c],
+                         *s = W[r * n + n - d + c];
+            double *o = W[r * n + c];
+            if (edges == 3)
+                TSS__EACH_LANE (l) o[l] = -(p[l] + q[l] + s[l]);
+            else
+                TSS__EACH_LANE (l) o[l] = -(p[l] + q[l]);
+        }
+    }
 }
 
-// All node blocks from the stretch Hessian and the rotated shape gradients b of nodes 1..edges, d
-// each. sum[j] gathers Σ_i H_ij.
+// Entries below the diagonal in columns first.. are those above it.
+TSS__INLINE void tss__mirror(int n, int first, int last, tss__lanes *W) {
+    for (int r = first + 1; r < n; r++)
+        for (int c = first; c < r && c < last; c++) memcpy(W[r * n + c], W[c * n + r], sizeof *W);
+}
+
+// All node blocks, n × n rows of lanes, from the stretch Hessian and the rotated shape gradients b
+// of nodes 1..edges, d each.
 TSS__INLINE void tss__assemble_in(int d, int edges, tss__lanes *b, tss__stretch *h, tss__lanes *W) {
-    TSS__ALIGN tss__lanes H[9];
-    TSS__ALIGN tss__lanes sum[27];
-    const int dd = d * d;
-    for (int i = 0; i < edges * dd; i++) TSS__EACH_LANE(l) sum[i][l] = 0;
+    const int n = d * (edges + 1);
     for (int i = 0; i < edges; i++)
         for (int j = i; j < edges; j++) {
-            if (d == 3) tss__node_block3(h, b + i * 3, b + j * 3, H);
-            else tss__node_block2(h, b + i * 2, b + j * 2, H);
-            tss__put_block(d, d * (edges + 1), i + 1, j + 1, H, W);
-            for (int k = 0; k < dd; k++) {
-                const double *v = H[k];
-                double *s = sum[j * dd + k], *st = sum[i * dd + k % d * d + k / d];
-                TSS__EACH_LANE(l) s[l] += v[l];
-                if (i != j) TSS__EACH_LANE(l) st[l] += v[l];
-            }
+            tss__lanes *H = W + ((i + 1) * n + j + 1) * d;
+            if (d == 3)
+                tss__node_block3(h, b + i * 3, b + j * 3, n, H);
+            else
+                tss__node_block2(h, b + i * 2, b + j * 2, n, H);
         }
-    tss__first_node(d, edges, sum, W);
+    tss__mirror(n, d, n, W);
+    tss__first_node(d, edges, W);
+    tss__mirror(n, 0, d, W);
 }
 
 TSS__STAGE void tss__assemble(int d, int edges, tss__lanes *b, tss__stretch *h, tss__lanes *W) {
-    if (d == 2) tss__assemble_in(2, 2, b, h, W);
-    else if (edges == 3) tss__assemble_in(3, 3, b, h, W);
-    else tss__assemble_in(3, 2, b, h, W);
+    if (d == 2)
+        tss__assemble_in(2, 2, b, h, W);
+    else if (edges == 3)
+        tss__assemble_in(3, 3, b, h, W);
+    else
+        tss__assemble_in(3, 2, b, h, W);
 }
 
 // b̂ = Vᵀ∇N, then all blocks.
 TSS__STAGE void tss__tile_assemble(int d, tss__tile *t, tss__stretch *h, tss__lanes *W) {
     TSS__ALIGN tss__lanes b[9];
-    if (d == 3) tss__mul(3, t->inv, h->V, 0, b);
-    else tss__mul(2, t->inv, h->V, 0, b);
+    if (d == 3)
+        tss__mul(3, t->inv, h->f.V, 0, b);
+    else
+        tss__mul(2, t->inv, h->f.V, 0, b);
     tss__assemble(d, d, b, h, W);
-}
-
-// Upper triangle of lanes → full symmetric matrices one after another.
-TSS__STAGE void tss__tile_scatter_sym(int n, int used, tss__lanes *TSS__RESTRICT W,
-                                       double *TSS__RESTRICT out) {
-    for (int l = 0; l < used; l++) {
-        double *o = out + (size_t)l * (size_t)(n * n);
-        for (int r = 0; r < n; r++)
-            for (int c = r; c < n; c++) o[r * n + c] = o[c * n + r] = W[r * n + c][l];
-    }
 }
 
 // --- custom densities: one call of the user's function a batch, matrices one after another ---
@@ -1879,12 +2077,15 @@ static double tss__vol_of(const tss__elastic *e, int id) {
 static void tss__custom_F(const tss__elastic *e, const double *x, tss_ids ids,
                           tss__custom_batch *b) {
     const int d2 = e->dim * e->dim;
+    TSS_ASSERT(ids.count <= TSS_BATCH);
     b->count = ids.count;
     for (int at = 0; at < ids.count; at += TSS_LANES) {
         tss__tile t;
         tss__tile_cells(e, &ids, at, &t);
-        if (e->dim == 3) tss__tile_F(3, e, x, &t);
-        else tss__tile_F(2, e, x, &t);
+        if (e->dim == 3)
+            tss__tile_F(3, e, x, &t);
+        else
+            tss__tile_F(2, e, x, &t);
         for (int l = 0; l < t.used; l++) b->cell[at + l] = t.id[l];
         tss__tile_scatter(d2, t.used, t.F, b->F + at * d2);
     }
@@ -1903,7 +2104,8 @@ static void tss__custom_value(const tss__elastic *e, const double *x, tss_ids id
     m->density(m->user, e->dim, b.count, b.cell, b.F, b.psi, NULL, NULL);
     for (int k = 0; k < b.count; k++) {
         out[k] = b.psi[k] * tss__vol_of(e, b.cell[k]);
-        if (m->barrier && !(tss__det_small(e->dim, b.F + k * e->dim * e->dim) > 0)) out[k] = HUGE_VAL;
+        if (m->barrier && !(tss__det_small(e->dim, b.F + k * e->dim * e->dim) > 0))
+            out[k] = HUGE_VAL;
     }
 }
 
@@ -1920,8 +2122,7 @@ static void tss__shape_gradients(const tss__elastic *e, int id, double *N) {
     }
 }
 
-static void tss__custom_gradient(const tss__elastic *e, const double *x, tss_ids ids,
-                                 double *out) {
+static void tss__custom_gradient(const tss__elastic *e, const double *x, tss_ids ids, double *out) {
     const int d = e->dim, a = d + 1;
     tss__custom_batch b;
     double N[12];
@@ -1955,7 +2156,8 @@ static void tss__custom_differences(const tss__elastic *e, int cell, const doubl
         for (int i = 0; i < n; i++) C[i * n + j] = (plus[i] - minus[i]) / (2 * step);
     }
     for (int i = 0; i < n; i++)
-        for (int j = 0; j < i; j++) C[i * n + j] = C[j * n + i] = 0.5 * (C[i * n + j] + C[j * n + i]);
+        for (int j = 0; j < i; j++)
+            C[i * n + j] = C[j * n + i] = 0.5 * (C[i * n + j] + C[j * n + i]);
 }
 
 // One Jacobi rotation in plane (p, q) of symmetric n × n A, A ← JᵀAJ, Q ← QJ.
@@ -2024,7 +2226,8 @@ static void tss__custom_hessian(const tss__elastic *e, const double *x, tss_ids 
         const double *F = b.F + k * dd;
         if (e->material.has_C)
             e->material.density(e->material.user, d, 1, b.cell + k, F, NULL, NULL, C);
-        else tss__custom_differences(e, b.cell[k], F, C);
+        else
+            tss__custom_differences(e, b.cell[k], F, C);
         if (psd) tss__clamp_dense(dd, C);
         tss__shape_gradients(e, b.cell[k], N);
         tss__custom_node_blocks(d, N, tss__vol_of(e, b.cell[k]), C, out + k * n * n);
@@ -2033,8 +2236,8 @@ static void tss__custom_hessian(const tss__elastic *e, const double *x, tss_ids 
 
 // --- the callbacks of the hook; one body of code a dimension and material ---
 
-TSS__INLINE void tss__value_tiles(int d, const tss__elastic *e, const double *x,
-                                  const tss_ids *ids, double *out) {
+TSS__INLINE void tss__value_tiles(int d, const tss__elastic *e, const double *x, const tss_ids *ids,
+                                  double *out) {
     for (int at = 0; at < ids->count; at += TSS_LANES) {
         tss__tile t;
         TSS__ALIGN tss__lanes psi;
@@ -2061,16 +2264,16 @@ TSS__INLINE void tss__gradient_tiles(int d, const tss__elastic *e, const double 
 
 static void tss__hessian_tiles(const tss__elastic *e, const double *x, const tss_ids *ids, int psd,
                                double *out) {
-    const int d = e->dim, n = d * (d + 1);
-    for (int at = 0; at < ids->count; at += TSS_LANES) {
-        tss__tile t;
-        TSS__ALIGN tss__stretch h;
+    const int d = e->dim, nn = d * (d + 1) * d * (d + 1);
+    for (int at = 0; at < ids->count; at += TSS__SVD_TILES * TSS_LANES) {
+        tss__tile t[TSS__SVD_TILES];
+        TSS__ALIGN tss__stretch h[TSS__SVD_TILES];
         TSS__ALIGN tss__lanes W[144];
-        tss__tile_cells(e, ids, at, &t);
-        tss__tile_F(d, e, x, &t);
-        tss__tile_stretch(d, e->material.kind, psd, &t, &h);
-        tss__tile_assemble(d, &t, &h, W);
-        tss__tile_scatter_sym(n, t.used, W, out + (size_t)at * (size_t)(n * n));
+        const int tiles = tss__some_tiles(e, x, ids, at, psd, t, h);
+        for (int g = 0; g < tiles; g++) {
+            tss__tile_assemble(d, t + g, h + g, W);
+            tss__tile_scatter(nn, t[g].used, W, out + (size_t)(at + g * TSS_LANES) * (size_t)nn);
+        }
     }
 }
 
@@ -2092,30 +2295,38 @@ static void tss__elastic_value(void *user, const tss_ctx *c, const double *x, ts
                                double *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c;
-    if (e->material.kind == TSS_CUSTOM_MATERIAL) tss__custom_value(e, x, ids, out);
-    else if (e->dim == 3) tss__value_3(e, x, &ids, out);
-    else tss__value_2(e, x, &ids, out);
+    if (e->material.kind == TSS_CUSTOM_MATERIAL)
+        tss__custom_value(e, x, ids, out);
+    else if (e->dim == 3)
+        tss__value_3(e, x, &ids, out);
+    else
+        tss__value_2(e, x, &ids, out);
 }
 
 static void tss__elastic_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                   double *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c;
-    if (e->material.kind == TSS_CUSTOM_MATERIAL) tss__custom_gradient(e, x, ids, out);
-    else if (e->dim == 3) tss__gradient_3(e, x, &ids, out);
-    else tss__gradient_2(e, x, &ids, out);
+    if (e->material.kind == TSS_CUSTOM_MATERIAL)
+        tss__custom_gradient(e, x, ids, out);
+    else if (e->dim == 3)
+        tss__gradient_3(e, x, &ids, out);
+    else
+        tss__gradient_2(e, x, &ids, out);
 }
 
 static void tss__elastic_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                  int psd, double *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c;
-    if (e->material.kind == TSS_CUSTOM_MATERIAL) tss__custom_hessian(e, x, ids, psd, out);
-    else tss__hessian_tiles(e, x, &ids, psd, out);
+    if (e->material.kind == TSS_CUSTOM_MATERIAL)
+        tss__custom_hessian(e, x, ids, psd, out);
+    else
+        tss__hessian_tiles(e, x, &ids, psd, out);
 }
 
-static tss_result tss__elastic_lists(void *user, const tss_ctx *c, const double *x,
-                                     const double *d, double t_max, tss_stencils *out) {
+static tss_result tss__elastic_lists(void *user, const tss_ctx *c, const double *x, const double *d,
+                                     double t_max, tss_stencils *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c, (void)x, (void)d, (void)t_max;
     out->count = e->cells;
@@ -2155,37 +2366,35 @@ typedef struct tss__cubic {
 } tss__cubic;
 
 // |A|, |B| sums of absolute entries: det and its mixed terms are below (|A|/3)³ …, rounded eight
-// times; eps·(…)³ without the part of A alone bounds the error of c1 T + c2 T² + c3 T³. It is convex
-// in T, so a share t/T of it bounds the error at t: it is taken off c1.
+// times; eps·(…)³ without the part of A alone bounds the error of c1 T + c2 T² + c3 T³. It is
+// convex in T, so a share t/T of it bounds the error at t: it is taken off c1.
 TSS__INLINE double tss__cubic_error(double a, double b) {
     return 2.3e-16 * b * (3 * a * (a + b) + b * b);
 }
 
-TSS__INLINE double tss__abs(double x) { return x < 0 ? -x : x; }
-
-TSS__INLINE void tss__cubic3(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT B,
-                             double T, tss__cubic *TSS__RESTRICT p) {
+TSS__INLINE void tss__cubic3(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT B, double T,
+                             tss__cubic *TSS__RESTRICT p) {
     TSS__ALIGN tss__lanes CA[9];
     TSS__ALIGN tss__lanes CB[9];
     TSS__ALIGN tss__lanes c1, c2, a, b;
     tss__cofactor(3, A, CA, p->c[0]);
     tss__cofactor(3, B, CB, p->c[3]);
-    TSS__EACH_LANE(l) c1[l] = 0, c2[l] = 0, a[l] = 0, b[l] = 0;
+    TSS__EACH_LANE (l) c1[l] = 0, c2[l] = 0, a[l] = 0, b[l] = 0;
     for (int i = 0; i < 9; i++)
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             c1[l] += CA[i][l] * B[i][l], c2[l] += CB[i][l] * A[i][l];
             a[l] += tss__abs(A[i][l]), b[l] += tss__abs(B[i][l]);
         }
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         p->c[0][l] *= 1 - TSS__KEEP_3D;
         p->c[1][l] = c1[l], p->c[2][l] = c2[l];
         p->err[l] = tss__cubic_error(a[l], T * b[l]);
     }
 }
 
-TSS__INLINE void tss__cubic2(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT B,
-                             double T, tss__cubic *TSS__RESTRICT p) {
-    TSS__EACH_LANE(l) {
+TSS__INLINE void tss__cubic2(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTRICT B, double T,
+                             tss__cubic *TSS__RESTRICT p) {
+    TSS__EACH_LANE (l) {
         double a = A[0][l], b = A[1][l], c = A[2][l], d = A[3][l];
         double u = B[0][l], v = B[1][l], w = B[2][l], z = B[3][l];
         double m = tss__abs(a) + tss__abs(b) + tss__abs(c) + tss__abs(d);
@@ -2201,7 +2410,7 @@ TSS__INLINE void tss__cubic2(tss__lanes *TSS__RESTRICT A, tss__lanes *TSS__RESTR
 // Signs of the Bernstein coefficients on [0, T], less the error: marks lanes that may have a root.
 TSS__INLINE int tss__bernstein(const tss__cubic *TSS__RESTRICT p, double T,
                                double *TSS__RESTRICT maybe) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double c0 = p->c[0][l], c1 = p->c[1][l] * T - p->err[l], c2 = p->c[2][l] * (T * T);
         double b1 = c0 + c1 * (1.0 / 3), b2 = c0 + c1 * (2.0 / 3) + c2 * (1.0 / 3);
         double b3 = c0 + c1 + c2 + p->c[3][l] * (T * T * T);
@@ -2309,8 +2518,7 @@ static void tss__filter_run(int block, int worker, void *arg) {
             tss__tile_edges(2, e->node, f->d, t.id, B);
             tss__cubic2(t.D, B, T, &p);
         }
-        if (tss__bernstein(&p, T, maybe))
-            tss__filter_lanes(f, &t, &p, maybe, T, &limit, &culprit);
+        if (tss__bernstein(&p, T, maybe)) tss__filter_lanes(f, &t, &p, maybe, T, &limit, &culprit);
     }
     e->limit[block] = limit;
     e->culprit[block] = culprit;
@@ -2350,8 +2558,10 @@ static void tss__min_J_run(int block, int worker, void *arg) {
         TSS__ALIGN tss__lanes C[9];
         TSS__ALIGN tss__lanes J;
         tss__tile_cells(e, &ids, at, &t);
-        if (e->dim == 3) tss__tile_F(3, e, f->x, &t), tss__cofactor(3, t.F, C, J);
-        else tss__tile_F(2, e, f->x, &t), tss__cofactor(2, t.F, C, J);
+        if (e->dim == 3)
+            tss__tile_F(3, e, f->x, &t), tss__cofactor(3, t.F, C, J);
+        else
+            tss__tile_F(2, e, f->x, &t), tss__cofactor(2, t.F, C, J);
         for (int l = 0; l < t.used; l++)
             if (J[l] < least) least = J[l], who = t.id[l];
     }
@@ -2381,6 +2591,8 @@ static tss_result tss__elastic_validate(int dim, int cells, const int *node, con
     if ((dim != 2 && dim != 3) || cells < 1 || !node || !X || !m) return TSS_ERROR_BAD_ARGUMENT;
     if ((unsigned)m->kind >= TSS_MATERIAL_KINDS) return TSS_ERROR_BAD_MATERIAL;
     if (m->kind == TSS_CUSTOM_MATERIAL && !m->density) return TSS_ERROR_BAD_MATERIAL;
+    if (!(m->damping >= 0) || m->damping > 1e300) return TSS_ERROR_BAD_MATERIAL;
+    if (m->kind == TSS_CUSTOM_MATERIAL && m->damping > 0) return TSS_ERROR_BAD_MATERIAL;
     const int n = E || nu || rho ? cells : 1;
     for (int i = 0; i < n; i++)
         if (!tss__material_ok(E ? E[i] : m->E, nu ? nu[i] : m->nu, rho ? rho[i] : m->rho))
@@ -2417,7 +2629,8 @@ static int tss__elastic_rest(tss__elastic *e, int cell, int slot, const double *
             }
     }
     const size_t block = (size_t)(slot / TSS_LANES);
-    for (int i = 0; i < d * d; i++) e->inv[block * (size_t)(d * d) + (size_t)i][slot % TSS_LANES] = inv[i];
+    for (int i = 0; i < d * d; i++)
+        e->inv[block * (size_t)(d * d) + (size_t)i][slot % TSS_LANES] = inv[i];
     e->vol[block][slot % TSS_LANES] = det / (d == 3 ? 6 : 2);
     return 1;
 }
@@ -2516,16 +2729,16 @@ static tss_energy_def tss__elastic_def(tss__elastic *e) {
 
 // ---------------------------------------------------------------------------------------------
 // >>damping (private)
-// D = damping/h · ½ (x − x_t)ᵀ H (x − x_t), H the projected elastic Hessian at x_t, kept for the step
-// as its principal frames and stretch blocks (33 numbers a cell in place of 144): the energy is
-// ½ G:C:G with G = F(x) − F(x_t) turned into the frame. Convex and quadratic; zero, with its
+// D = damping/h · ½ (x − x_t)ᵀ H (x − x_t), H the projected elastic Hessian at x_t, kept for the
+// step as its principal frames and stretch blocks (33 numbers a cell in place of 144): the energy
+// is ½ G:C:G with G = F(x) − F(x_t) turned into the frame. Convex and quadratic; zero, with its
 // gradient, at x_t.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss__damping {
-    tss__elastic *e;        // not owned; outlives all calls but destroy
+    tss__elastic *e;  // not owned; outlives all calls but destroy
     int blocks;
-    tss__stretch *frozen;   // blocks: U, V, S, A, B with the volume in
+    tss__stretch *frozen;  // blocks: U, V, S, A, B with the volume in
 } tss__damping;
 
 #define TSS__STRETCH_LANES (int)(sizeof(tss__stretch) / sizeof(tss__lanes))
@@ -2541,11 +2754,9 @@ static void tss__freeze_run(int block, int worker, void *arg) {
     const int first = block * TSS__FILTER_CELLS, left = e->cells - first;
     const tss_ids ids = {first, left < TSS__FILTER_CELLS ? left : TSS__FILTER_CELLS, NULL};
     (void)worker;
-    for (int at = 0; at < ids.count; at += TSS_LANES) {
-        tss__tile t;
-        tss__tile_cells(e, &ids, at, &t);
-        tss__tile_F(e->dim, e, f->x, &t);
-        tss__tile_stretch(e->dim, e->material.kind, 1, &t, f->m->frozen + (first + at) / TSS_LANES);
+    for (int at = 0; at < ids.count; at += TSS__SVD_TILES * TSS_LANES) {
+        tss__tile t[TSS__SVD_TILES];
+        tss__some_tiles(e, f->x, &ids, at, 1, t, f->m->frozen + (first + at) / TSS_LANES);
     }
 }
 
@@ -2560,9 +2771,9 @@ static tss_result tss__damping_begin(void *user, const tss_ctx *c) {
 static tss__stretch *tss__frozen_of(const tss__damping *m, const tss_ids *ids, const tss__tile *t,
                                     tss__stretch *copy) {
     if (!ids->list && t->id[0] % TSS_LANES == 0) return m->frozen + t->id[0] / TSS_LANES;
-    double *to = copy->U[0];
+    double *to = copy->f.U[0];
     for (int l = 0; l < TSS_LANES; l++) {
-        const double *from = m->frozen[t->id[l] / TSS_LANES].U[0];
+        const double *from = m->frozen[t->id[l] / TSS_LANES].f.U[0];
         for (int i = 0; i < TSS__STRETCH_LANES; i++)
             to[i * TSS_LANES + l] = from[i * TSS_LANES + t->id[l] % TSS_LANES];
     }
@@ -2574,15 +2785,15 @@ TSS__INLINE void tss__stretch_apply(int d, tss__stretch *TSS__RESTRICT h,
                                     tss__lanes *TSS__RESTRICT G, tss__lanes *TSS__RESTRICT P) {
     for (int a = 0; a < d; a++) {
         double *p = P[a * (d + 1)];
-        TSS__EACH_LANE(l) p[l] = h->S[a][l] * G[a * (d + 1)][l];
+        TSS__EACH_LANE (l) p[l] = h->S[a][l] * G[a * (d + 1)][l];
         for (int b = 0; b < d; b++) {
             if (b == a) continue;
             const double *s = h->S[3 + (3 - a - b)], *g = G[b * (d + 1)];
-            TSS__EACH_LANE(l) p[l] += s[l] * g[l];
+            TSS__EACH_LANE (l) p[l] += s[l] * g[l];
             const double *A = h->flip[3 - a - b], *B = h->twist[3 - a - b];
             const double *ab = G[a * d + b], *ba = G[b * d + a];
             double *o = P[a * d + b];
-            TSS__EACH_LANE(l) o[l] = A[l] * ab[l] + B[l] * ba[l];
+            TSS__EACH_LANE (l) o[l] = A[l] * ab[l] + B[l] * ba[l];
         }
     }
 }
@@ -2592,13 +2803,13 @@ TSS__INLINE void tss__turn(int d, tss__stretch *h, int back, tss__lanes *B, tss_
     TSS__ALIGN tss__lanes T[9];
     TSS__ALIGN tss__lanes Ut[9];
     if (!back) {
-        tss__mul(d, h->U, B, 0, T);
-        tss__mul(d, T, h->V, 1, out);
+        tss__mul(d, h->f.U, B, 0, T);
+        tss__mul(d, T, h->f.V, 1, out);
         return;
     }
-    for (int i = 0; i < d * d; i++) memcpy(Ut[i], h->U[i % d * d + i / d], sizeof *Ut);
+    for (int i = 0; i < d * d; i++) memcpy(Ut[i], h->f.U[i % d * d + i / d], sizeof *Ut);
     tss__mul(d, Ut, B, 0, T);
-    tss__mul(d, T, h->V, 0, out);
+    tss__mul(d, T, h->f.V, 0, out);
 }
 
 // Ĝ of x − x_t and P̂ of a tile.
@@ -2608,7 +2819,8 @@ TSS__INLINE void tss__damping_tile(int d, const tss__elastic *e, const tss_ctx *
     TSS__ALIGN tss__lanes dF[9];
     tss__tile_edges(d, e->node, x, t->id, t->D);
     tss__tile_edges(d, e->node, c->x_t, t->id, D);
-    for (int i = 0; i < d * d; i++) TSS__EACH_LANE(l) D[i][l] = t->D[i][l] - D[i][l];
+    for (int i = 0; i < d * d; i++)
+        TSS__EACH_LANE (l) D[i][l] = t->D[i][l] - D[i][l];
     // D[k·d + r] is the transposed edge matrix: dF = Dᵀ Dm⁻¹.
     for (int i = 0; i < d * d; i++) memcpy(t->D[i], D[i % d * d + i / d], sizeof *D);
     tss__mul(d, t->D, t->inv, 0, dF);
@@ -2631,8 +2843,9 @@ TSS__INLINE void tss__damping_value_tiles(int d, const tss__damping *m, const ts
         TSS__ALIGN tss__lanes v;
         tss__tile_cells(m->e, ids, at, &t);
         tss__damping_tile(d, m->e, c, x, tss__frozen_of(m, ids, &t, &copy), &t, G, P);
-        TSS__EACH_LANE(l) v[l] = 0;
-        for (int i = 0; i < d * d; i++) TSS__EACH_LANE(l) v[l] += G[i][l] * P[i][l];
+        TSS__EACH_LANE (l) v[l] = 0;
+        for (int i = 0; i < d * d; i++)
+            TSS__EACH_LANE (l) v[l] += G[i][l] * P[i][l];
         for (int l = 0; l < t.used; l++) out[at + l] = scale * v[l];
     }
 }
@@ -2652,7 +2865,7 @@ TSS__INLINE void tss__damping_gradient_tiles(int d, const tss__damping *m, const
         tss__damping_tile(d, m->e, c, x, h, &t, G, P);
         tss__turn(d, h, 0, P, G);
         const double s = tss__damping_scale(m, c);
-        TSS__EACH_LANE(l) scale[l] = s;
+        TSS__EACH_LANE (l) scale[l] = s;
         t.vol = scale;  // the volume is in the frozen blocks
         tss__tile_forces(d, &t, G, g);
         tss__tile_scatter(n, t.used, g, out + at * n);
@@ -2662,19 +2875,23 @@ TSS__INLINE void tss__damping_gradient_tiles(int d, const tss__damping *m, const
 static void tss__damping_value(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                double *out) {
     const tss__damping *m = (const tss__damping *)user;
-    if (m->e->dim == 3) tss__damping_value_tiles(3, m, c, x, &ids, out);
-    else tss__damping_value_tiles(2, m, c, x, &ids, out);
+    if (m->e->dim == 3)
+        tss__damping_value_tiles(3, m, c, x, &ids, out);
+    else
+        tss__damping_value_tiles(2, m, c, x, &ids, out);
 }
 
 static void tss__damping_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                   double *out) {
     const tss__damping *m = (const tss__damping *)user;
-    if (m->e->dim == 3) tss__damping_gradient_tiles(3, m, c, x, &ids, out);
-    else tss__damping_gradient_tiles(2, m, c, x, &ids, out);
+    if (m->e->dim == 3)
+        tss__damping_gradient_tiles(3, m, c, x, &ids, out);
+    else
+        tss__damping_gradient_tiles(2, m, c, x, &ids, out);
 }
 
-static void tss__damping_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd,
-                                 double *out) {
+static void tss__damping_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                 int psd, double *out) {
     const tss__damping *m = (const tss__damping *)user;
     const int d = m->e->dim, n = d * (d + 1);
     const double scale = tss__damping_scale(m, c);
@@ -2686,13 +2903,13 @@ static void tss__damping_hessian(void *user, const tss_ctx *c, const double *x, 
         double *o = out + (size_t)at * (size_t)(n * n);
         tss__tile_cells(m->e, &ids, at, &t);
         tss__tile_assemble(d, &t, tss__frozen_of(m, &ids, &t, &copy), W);
-        tss__tile_scatter_sym(n, t.used, W, o);
+        tss__tile_scatter(n * n, t.used, W, o);
         for (int i = 0; i < t.used * n * n; i++) o[i] *= scale;
     }
 }
 
-static tss_result tss__damping_lists(void *user, const tss_ctx *c, const double *x,
-                                     const double *d, double t_max, tss_stencils *out) {
+static tss_result tss__damping_lists(void *user, const tss_ctx *c, const double *x, const double *d,
+                                     double t_max, tss_stencils *out) {
     const tss__elastic *e = ((const tss__damping *)user)->e;
     (void)c, (void)x, (void)d, (void)t_max;
     out->count = e->cells, out->node = e->node, out->pattern = 1;
@@ -2750,10 +2967,10 @@ static tss_result tss__damping_create(const tss_host *host, tss__elastic *e, tss
 typedef struct tss__membrane {
     int triangles, blocks;
     tss_material_kind kind;
-    double mu, lambda;  // lambda of plane stress
-    int *node;          // triangles × 3
-    tss__lanes *inv;    // blocks × 4
-    tss__lanes *weight; // blocks: area × thickness
+    double mu, lambda;   // lambda of plane stress
+    int *node;           // triangles × 3
+    tss__lanes *inv;     // blocks × 4
+    tss__lanes *weight;  // blocks: area × thickness
 } tss__membrane;
 
 typedef struct tss__sheet {
@@ -2769,16 +2986,18 @@ static void tss__sheet_load(const tss__membrane *m, const double *x, const tss_i
     TSS__ALIGN tss__lanes D[6];
     s->used = ids->count - at < TSS_LANES ? ids->count - at : TSS_LANES;
     for (int l = 0; l < TSS_LANES; l++) {
-        const int k = at + (l < s->used ? l : s->used - 1), id = ids->list ? ids->list[k] : ids->first + k;
+        const int k = at + (l < s->used ? l : s->used - 1),
+                  id = ids->list ? ids->list[k] : ids->first + k;
         const int *n = m->node + (size_t)id * 3, b = id / TSS_LANES, lane = id % TSS_LANES;
         for (int e = 0; e < 2; e++)
             for (int r = 0; r < 3; r++)
-                D[r * 2 + e][l] = x[(size_t)n[e + 1] * 3 + (size_t)r] - x[(size_t)n[0] * 3 + (size_t)r];
+                D[r * 2 + e][l] =
+                    x[(size_t)n[e + 1] * 3 + (size_t)r] - x[(size_t)n[0] * 3 + (size_t)r];
         for (int i = 0; i < 4; i++) s->inv[i][l] = m->inv[(size_t)b * 4 + (size_t)i][lane];
         s->weight[l] = m->weight[b][lane];
     }
     for (int r = 0; r < 3; r++)
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             double a = D[r * 2][l], b = D[r * 2 + 1][l];
             s->F[r * 2][l] = a * s->inv[0][l] + b * s->inv[2][l];
             s->F[r * 2 + 1][l] = a * s->inv[1][l] + b * s->inv[3][l];
@@ -2786,10 +3005,11 @@ static void tss__sheet_load(const tss__membrane *m, const double *x, const tss_i
 }
 
 static void tss__sheet_strain(tss__sheet *s) {
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double a = s->F[0][l], b = s->F[1][l], c = s->F[2][l], d = s->F[3][l];
         double e = s->F[4][l], f = s->F[5][l];
-        double xx = a * a + c * c + e * e - 1, yy = b * b + d * d + f * f - 1, xy = a * b + c * d + e * f;
+        double xx = a * a + c * c + e * e - 1, yy = b * b + d * d + f * f - 1,
+               xy = a * b + c * d + e * f;
         // det C as the squared area: no cancellation where the triangle is thin.
         double nx = c * f - e * d, ny = e * b - a * f, nz = a * d - c * b;
         s->delta[0][l] = xx, s->delta[1][l] = yy, s->delta[2][l] = xy;
@@ -2822,9 +3042,10 @@ static void tss__membrane_value(void *user, const tss_ctx *c, const double *x, t
         tss__sheet_load(m, x, &ids, at, &s);
         tss__sheet_strain(&s);
         if (m->kind == TSS_STVK)
-            TSS__EACH_LANE(l) v[l] = 0.25 * mu * s.delta2[l] + 0.125 * lambda * (s.tr[l] * s.tr[l]);
+            TSS__EACH_LANE (l)
+                v[l] = 0.25 * mu * s.delta2[l] + 0.125 * lambda * (s.tr[l] * s.tr[l]);
         else
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double gap, y = tss__log_det_C(s.tr[l], s.det[l], s.delta2[l], s.J2[l], &gap);
                 double psi = 0.5 * mu * gap + 0.125 * lambda * (y * y);
                 v[l] = s.J2[l] > 0 ? psi : HUGE_VAL;
@@ -2837,14 +3058,14 @@ static void tss__membrane_value(void *user, const tss_ctx *c, const double *x, t
 static void tss__sheet_stress(const tss__membrane *m, tss__sheet *s, tss__lanes *S) {
     const double mu = m->mu, lambda = m->lambda;
     if (m->kind == TSS_STVK) {
-        TSS__EACH_LANE(l) {
+        TSS__EACH_LANE (l) {
             double t = 0.5 * lambda * s->tr[l];
             S[0][l] = mu * s->delta[0][l] + t, S[1][l] = mu * s->delta[1][l] + t;
             S[2][l] = mu * s->delta[2][l];
         }
         return;
     }
-    TSS__EACH_LANE(l) {
+    TSS__EACH_LANE (l) {
         double gap, y = tss__log_det_C(s->tr[l], s->det[l], s->delta2[l], s->J2[l], &gap);
         double xx = s->delta[0][l], yy = s->delta[1][l], xy = s->delta[2][l];
         // adj(C) (mu delta + t I)/det C; adj(C) delta = adj(I + delta) delta = delta + det delta I.
@@ -2867,7 +3088,7 @@ static void tss__membrane_gradient(void *user, const tss_ctx *c, const double *x
         tss__sheet_strain(&s);
         tss__sheet_stress(m, &s, S);
         for (int r = 0; r < 3; r++)
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double a = s.F[r * 2][l], b = s.F[r * 2 + 1][l], w = s.weight[l];
                 double p = w * (a * S[0][l] + b * S[2][l]), q = w * (a * S[2][l] + b * S[1][l]);
                 double g1 = p * s.inv[0][l] + q * s.inv[1][l];
@@ -2882,8 +3103,8 @@ static void tss__membrane_gradient(void *user, const tss_ctx *c, const double *x
 static void tss__sheet_stretch(const tss__membrane *m, tss__stretch *h) {
     const double mu = m->mu, lambda = m->lambda;
     const int stvk = m->kind == TSS_STVK;
-    TSS__EACH_LANE(l) {
-        double a = h->sigma[0][l], b = h->sigma[1][l], a2 = a * a, b2 = b * b, ab = a * b;
+    TSS__EACH_LANE (l) {
+        double a = h->f.sigma[0][l], b = h->f.sigma[1][l], a2 = a * a, b2 = b * b, ab = a * b;
         double half = 0.5 * lambda * (a2 + b2 - 2), c = mu - lambda * tss__log(ab), i = 1 / ab;
         double ia = 1 / a2, ib = 1 / b2;
         h->S[0][l] = stvk ? mu * (3 * a2 - 1) + half + lambda * a2 : mu + (c + lambda) * ia;
@@ -2910,20 +3131,21 @@ static void tss__membrane_hessian(void *user, const tss_ctx *c, const double *x,
         TSS__ALIGN tss__stretch h;
         tss__sheet_load(m, x, &ids, at, &s);
         for (int r = 0; r < 3; r++)
-            TSS__EACH_LANE(l)
-                F[r * 3][l] = s.F[r * 2][l], F[r * 3 + 1][l] = s.F[r * 2 + 1][l], F[r * 3 + 2][l] = 0;
-        tss__svd(3, F, h.U, h.sigma, h.V);
+            TSS__EACH_LANE (l)
+                F[r * 3][l] = s.F[r * 2][l], F[r * 3 + 1][l] = s.F[r * 2 + 1][l],
+                      F[r * 3 + 2][l] = 0;
+        tss__svd_one(3, F, &h.f);
         tss__sheet_stretch(m, &h);
         tss__stretch_finish(2, psd, s.weight, &h);
         for (int k = 0; k < 2; k++)
-            TSS__EACH_LANE(l) {
+            TSS__EACH_LANE (l) {
                 double p = s.inv[k * 2][l], q = s.inv[k * 2 + 1][l];
-                b[k * 3][l] = p * h.V[0][l] + q * h.V[3][l];
-                b[k * 3 + 1][l] = p * h.V[1][l] + q * h.V[4][l];
+                b[k * 3][l] = p * h.f.V[0][l] + q * h.f.V[3][l];
+                b[k * 3 + 1][l] = p * h.f.V[1][l] + q * h.f.V[4][l];
                 b[k * 3 + 2][l] = 0;
             }
         tss__assemble(3, 2, b, &h, W);
-        tss__tile_scatter_sym(9, s.used, W, out + (size_t)at * 81);
+        tss__tile_scatter(81, s.used, W, out + (size_t)at * 81);
     }
 }
 
@@ -3036,17 +3258,18 @@ tss_result tss_membrane_energy(const tss_host *host, const tss_membrane_def *def
 
 // ---------------------------------------------------------------------------------------------
 // >>hinges (private)
-// e = x_1 − x_0, a = x_2 − x_0, b = x_3 − x_0; normals m = e × a of (0, 1, 2), n = b × e of (1, 0, 3).
+// e = x_1 − x_0, a = x_2 − x_0, b = x_3 − x_0; normals m = e × a of (0, 1, 2), n = b × e of
+// (1, 0, 3).
 // theta = atan2(−(m × n)·ê, m·n) with derivatives
 //     g_2 = |e| m/|m|²,  g_3 = |e| n/|n|²,  g_1 = −s_a g_2 − s_b g_3,  g_0 = −g_1 − g_2 − g_3,
 // s_a = a·e/|e|² the foot of x_2 on the edge; their derivatives give ∇²theta row by row. A triangle
-// without area has no normal: its terms are cut off (1e-290), the angle's gradient grows as 1/height.
+// without area has no normal: its terms are cut off (1e-290); the gradient grows as 1/height.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss__hinges {
     int count;
-    int *node;             // count × 4
-    double *weight, *rest; // 3 k ‖e‖²/(A_1 + A_2); angle
+    int *node;              // count × 4
+    double *weight, *rest;  // 3 k ‖e‖²/(A_1 + A_2); angle
 } tss__hinges;
 
 typedef struct tss__hinge {
@@ -3109,8 +3332,8 @@ static void tss__wing_derivative(const tss__hinge *h, const double *a, const dou
     for (int c = 0; c < 3; c++) {
         double unit[3] = {0, 0, 0}, de[3], da[3];
         unit[c] = sign;
-        tss__cross(unit, a, de);    // ∂m/∂e_c
-        tss__cross(h->e, unit, da); // ∂m/∂a_c
+        tss__cross(unit, a, de);     // ∂m/∂e_c
+        tss__cross(h->e, unit, da);  // ∂m/∂a_c
         const double te = 2 * tss__dot(m, de) / mm, ta = 2 * tss__dot(m, da) / mm;
         for (int r = 0; r < 3; r++) {
             by_e[r * 3 + c] = (m[r] * h->e[c] / h->length + h->length * (de[r] - te * m[r])) / mm;
@@ -3194,8 +3417,10 @@ static void tss__hinges_hessian(void *user, const tss_ctx *c, const double *x, t
         tss__hinge h;
         tss__hinge_load(e->node + (size_t)id * 4, x, &h);
         tss__hinge_gradient(&h, g);
-        if (psd) memset(H, 0, 144 * sizeof *H);
-        else tss__hinge_hessian(&h, H), bend = tss__hinge_bend(&h, e->rest[id]);
+        if (psd)
+            memset(H, 0, 144 * sizeof *H);
+        else
+            tss__hinge_hessian(&h, H), bend = tss__hinge_bend(&h, e->rest[id]);
         for (int r = 0; r < 12; r++)
             for (int j = 0; j < 12; j++)
                 H[r * 12 + j] = e->weight[id] * (g[r] * g[j] + bend * H[r * 12 + j]);
@@ -3280,7 +3505,7 @@ tss_result tss_hinge_energy(const tss_host *host, const tss_hinge_def *def, tss_
 
 typedef struct tss__springs {
     int count, dim;
-    int *node;       // count × 2
+    int *node;  // count × 2
     double *k, *rest;
 } tss__springs;
 
@@ -3320,8 +3545,8 @@ static void tss__springs_gradient(void *user, const tss_ctx *c, const double *x,
     }
 }
 
-static void tss__springs_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd,
-                                 double *out) {
+static void tss__springs_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids,
+                                 int psd, double *out) {
     const tss__springs *e = (const tss__springs *)user;
     const int d = e->dim, n = 2 * d;
     (void)c;
@@ -3419,7 +3644,9 @@ tss_result tss_spring_energy(const tss_host *host, const tss_spring_def *def, ts
     return TSS_OK;
 }
 
-#if defined(__GNUC__) && !defined(__clang__)
+#if defined(__clang__)
+#pragma clang diagnostic pop
+#elif defined(__GNUC__)
 #pragma GCC pop_options
 #endif
 
@@ -3472,20 +3699,21 @@ static int tss__max_int(int a, int b) { return a > b ? a : b; }
 // ---------------------------------------------------------------------------------------------
 // >>dense_kernels (private)
 // Column-major products and triangular solves of fixed shape, the ground of both Cholesky
-// factorisations. The product C = β C + α A Bᵀ packs B in panels of NR columns and A in strips of MR
-// rows and runs a register kernel over them (Goto and van de Geijn 2008): AVX-512 or AVX2 with fused
-// multiply-adds where the processor has them (asked at run time), else whatever vectors the target
-// has. The triangular parts are recursions over the product.
+// factorisations. The product C = β C + α A Bᵀ packs B in panels of NR columns, takes A in strips of
+// MR rows and runs a register kernel over them (Goto and van de Geijn 2008): AVX-512 or AVX2 with
+// fused multiply-adds where the processor has them (asked at run time), else whatever vectors the
+// target has. The triangular parts are recursions over the product. An entry's sum runs over k in
+// order, so tiles, strips and alignment do not change bits; the processor's kind does.
 // Serial, no state, no memory but the stack (120 kB): threads work on different tiles. A BLAS was
-// tried and dropped: Debian's serial OpenBLAS 0.3.21 returned wrong products in 2 of 1,000 concurrent
-// calls (its buffers are handed out without a lock), threaded ones change bits with the number of
-// threads, and both were slower than this on the sizes that matter here.
+// tried and dropped: Debian's serial OpenBLAS 0.3.21 returned wrong products in 2 of 1,000
+// concurrent calls (its buffers are handed out without a lock), threaded ones change bits with the
+// number of threads, and none was faster in the factorisation as a whole.
 // ---------------------------------------------------------------------------------------------
 
 enum { TSS__KC = 192, TSS__NC = 48, TSS__MR_MAX = 24, TSS__NR_MAX = 8 };
 
-// One tile: C (w × v, w ≤ MR, v ≤ NR) = β C + α Â B̂; step p of Â is at a + p·as (MR rows; where the
-// strip is not packed only w are read), of B̂ at b + p·NR. β is 0 or 1.
+// One tile: C (w × v, w ≤ MR, v ≤ NR) = β C + α Â B̂; step p of Â is at a + p·as (MR rows; of a strip
+// read in place only w), of B̂ at b + p·NR. β is 0 or 1.
 typedef void tss__micro(int k, const double *a, ptrdiff_t as, const double *b, double alpha,
                         double beta, double *c, int ldc, int w, int v);
 
@@ -3541,6 +3769,14 @@ static void tss__micro_any(int k, const double *a, ptrdiff_t as, const double *b
 }
 
 #ifdef TSS__X86
+
+// What the processor has; tests define these as 0 to reach the other kernels.
+#ifndef TSS__HAS_AVX512
+#define TSS__HAS_AVX512 __builtin_cpu_supports("avx512f")
+#endif
+#ifndef TSS__HAS_AVX2
+#define TSS__HAS_AVX2 (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+#endif
 
 #define TSS__COLUMNS4(X) X(0) X(1) X(2) X(3)
 #define TSS__COLUMNS8(X) TSS__COLUMNS4(X) X(4) X(5) X(6) X(7)
@@ -3626,9 +3862,9 @@ static tss__kernel tss__kernel_here(void) {
     tss__kernel r;
     r.run = tss__micro_any, r.mr = 2 * TSS__VEC, r.nr = 4, r.direct = 0;
 #ifdef TSS__X86
-    if (__builtin_cpu_supports("avx512f")) {
+    if (TSS__HAS_AVX512) {
         r.run = tss__micro_avx512, r.mr = 24, r.nr = 8, r.direct = 1;
-    } else if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
+    } else if (TSS__HAS_AVX2) {
         r.run = tss__micro_avx2, r.mr = 12, r.nr = 4;
     }
 #endif
@@ -3801,7 +4037,7 @@ static void tss__trsm_base(int m, int n, const double *l, int ldl, double *b, in
     double inv[TSS__TRI];
     for (int j = 0; j < n; j++) inv[j] = 1 / l[j + (ptrdiff_t)j * ldl];
 #ifdef TSS__X86
-    if (__builtin_cpu_supports("avx512f")) {
+    if (TSS__HAS_AVX512) {
         tss__trsm_rows_avx512(m, n, l, ldl, inv, b, ldb);
         return;
     }
@@ -3830,12 +4066,17 @@ static void tss__trsm(int m, int n, const double *l, int ldl, double *b, int ldb
     tss__trsm(m, n - h, l + h + (ptrdiff_t)h * ldl, ldl, b + (ptrdiff_t)h * ldb, ldb);
 }
 
+// A pivot is taken if it is a finite number above what rounding alone could leave of diag.
+static int tss__pivot_ok(double pivot, double diag, double tol) {
+    return pivot > 0 && pivot > tol * diag && pivot <= 1.7976931348623157e308;
+}
+
 // Lower Cholesky of an n ≤ 8 block. diag: the diagonal before any elimination; a pivot not above
 // tol · diag (a NaN included) fails. Returns −1 or the failing column.
 static int tss__potrf_base(int n, double *a, int lda, const double *diag, double tol) {
     for (int j = 0; j < n; j++) {
         double *aj = a + (ptrdiff_t)j * lda;
-        if (!(aj[j] > tol * diag[j]) || !(aj[j] > 0) || !(aj[j] <= 1.7976931348623157e308)) return j;
+        if (!tss__pivot_ok(aj[j], diag[j], tol)) return j;
         double p = sqrt(aj[j]), inv = 1 / p;
         aj[j] = p;
         for (int i = j + 1; i < n; i++) aj[i] *= inv;
@@ -5081,7 +5322,7 @@ static void tss__cut_set(tss__cut *c, int *count) {
     int first = tss__cut_search(c, c->set[0], boundary, &largest);
     count[0] = count[1] = count[2] = 0;
     if (first < c->m) {
-        // The largest component alone if it is most of the set, else the boundary nearest the middle.
+        // The largest component alone if it is most of the set, else the middlemost boundary.
         int giant = 2 * largest > c->m;
         for (int i = 0; i < c->m; i++) {
             int in = giant ? i >= boundary[1] && i < boundary[1] + largest : i < boundary[0];
@@ -5186,12 +5427,15 @@ static tss_result tss__order_nodes(const tss_host *host, const tss__graph *g, in
 // >>cholesky (private)
 // ---------------------------------------------------------------------------------------------
 
+#define TSS__NO_MATRIX UINT64_MAX  // the stamp of a B that is NULL
+
 struct tss_chol {
     tss_host host;
     tss_chol_def def;
     tss__sym sym[2];          // the structure in use and the one being made
     int now, analyzed, factored;
-    int order_n;              // the kept ordering's size; 0: none
+    int order_n, order_d;     // the kept ordering's size; 0: none
+    int stale;                // the structure is not to be used again
     uint64_t pattern[2];      // stamps of A and B that are known to lie in the structure
     double flops_ordered;     // right after the last ordering
     int64_t contacts;         // B's blocks when the structure was made
@@ -5400,7 +5644,7 @@ static tss_result tss__chol_reorder(tss_chol *c, const tss__graph *g) {
     if (!order) return TSS_ERROR_NO_MEMORY;
     tss_result r = tss__order_nodes(&c->host, g, c->def.use_metis, c->def.seed, order);
     if (r) return r;
-    c->order_n = g->n;
+    c->order_n = g->n, c->order_d = g->d;
     c->orderings++;
     return TSS_OK;
 }
@@ -5412,8 +5656,10 @@ static int64_t tss__contact_blocks(const tss__graph *g) {
 // A new structure in the spare place, with the kept ordering or (where that has become too dear,
 // by predicted flops) a fresh one.
 static tss_result tss__chol_restructure(tss_chol *c, const tss__graph *g) {
-    tss__sym *y = &c->sym[!c->now];
-    int keep = c->order_n == g->n && c->analyzed && c->sym[c->now].d == g->d;
+    int fresh = !c->analyzed || c->stale;  // nothing to keep: its memory is used again
+    tss__sym *y = &c->sym[fresh ? c->now : !c->now];
+    c->analyzed &= !fresh;
+    int keep = c->order_n > 0 && c->order_n == g->n && c->order_d == g->d;
     tss_result r;
     if (keep) {
         if ((r = tss__sym_build(c, g, y)) != TSS_OK) return r;
@@ -5426,7 +5672,8 @@ static tss_result tss__chol_restructure(tss_chol *c, const tss__graph *g) {
         c->flops_ordered = y->flops;
     }
     c->contacts = tss__contact_blocks(g);
-    c->now = !c->now;
+    if (!fresh) c->now = !c->now;
+    c->stale = 0;
     c->analyzed = 1;
     c->factored = 0;
     return TSS_OK;
@@ -5438,7 +5685,9 @@ static tss_result tss__chol_restructure(tss_chol *c, const tss__graph *g) {
 static int tss__chol_serves(tss_chol *c, const tss__graph *g) {
     const tss__sym *y = &c->sym[c->now];
     if (!c->analyzed || y->n != g->n || y->d != g->d) return 0;
-    uint64_t b = g->m[1] ? g->m[1]->pattern : 1;
+    // Forgotten; without contacts then and now a new one would be the same.
+    if (c->stale && (c->contacts > 0 || tss__contact_blocks(g) > 0)) return 0;
+    uint64_t b = g->m[1] ? g->m[1]->pattern : TSS__NO_MATRIX;
     if (g->m[0]->pattern && b && g->m[0]->pattern == c->pattern[0] && b == c->pattern[1]) return 1;
     double work = 1000.0 * ((double)y->rowptr[y->fronts] + y->n);
     if (2 * tss__contact_blocks(g) < c->contacts && work < 0.1 * y->flops) return 0;
@@ -5462,13 +5711,37 @@ tss_result tss_chol_analyze(tss_chol *c, const tss_bcsr *A, const tss_bcsr *B) {
     int serves = tss__chol_serves(c, &g);
     if (serves < 0) return TSS_ERROR_NO_MEMORY;
     if (serves) {
+        c->stale = 0;
         c->reuse = TSS_CHOL_KEPT;
     } else {
         tss_result r = tss__chol_restructure(c, &g);
         if (r) return r;
     }
     c->pattern[0] = A->pattern;
-    c->pattern[1] = B ? B->pattern : 1;
+    c->pattern[1] = B ? B->pattern : TSS__NO_MATRIX;
+    return TSS_OK;
+}
+
+void tss_chol_forget(tss_chol *c) { c->stale = 1; }
+
+int tss_chol_get_order(const tss_chol *c, int *order, double *flops) {
+    if (order && c->order_n > 0) memcpy(order, c->order.p, (size_t)c->order_n * sizeof(int));
+    if (flops) *flops = c->flops_ordered;
+    return c->order_n;
+}
+
+tss_result tss_chol_set_order(tss_chol *c, int n, int d, const int *order, double flops) {
+    if (n < 0 || d < 1 || d > 3 || (n > 0 && !order)) return TSS_ERROR_BAD_ARGUMENT;
+    int *seen = tss__need_ints(&c->host, &c->bad, (size_t)n);
+    if (!seen) return TSS_ERROR_NO_MEMORY;
+    memset(seen, 0, (size_t)n * sizeof(int));
+    for (int i = 0; i < n; i++)
+        if (order[i] < 0 || order[i] >= n || seen[order[i]]++) return TSS_ERROR_BAD_ARGUMENT;
+    c->order_n = 0, c->analyzed = 0, c->factored = 0;
+    int *to = tss__need_ints(&c->host, &c->order, (size_t)n);
+    if (!to) return TSS_ERROR_NO_MEMORY;
+    if (n > 0) memcpy(to, order, (size_t)n * sizeof(int));
+    c->order_n = n, c->order_d = d, c->flops_ordered = flops;
     return TSS_OK;
 }
 
@@ -5580,7 +5853,7 @@ static int tss__lower_bound(const int *rel, int lo, int hi, int at) {
     return lo;
 }
 
-// dst += src for the d columns of one node of a child's U: rows i of the child (nodes) go to rel[i].
+// dst += src for the d columns of one node of a child's U: its row i (a node) goes to rel[i].
 static void tss__add_runs(const int *rel, int i, int end, int d, const double *src, int src_ld,
                           double *dst, int dst_ld) {
     while (i < end) {
@@ -8588,6 +8861,7 @@ static tss_result tss__begin_step(tss_world *w) {
     memcpy(w->v_t.p, w->v.p, bytes);
     memcpy(w->x_k.p, w->x.p, bytes);
     tss__fill_ctx(w);
+    if (w->chol) tss_chol_forget(w->chol);  // a resumed run takes the same path
     tss_result r = TSS_OK;
     if (w->def.integrator == TSS_NEWMARK && w->history == 0) r = tss__start_newmark(w);
     if (r != TSS_OK) return r;
@@ -8858,7 +9132,8 @@ typedef struct tss__head {
     uint64_t magic, version, dim, n, energies, steps;
     int64_t history;
     double time, ah2, dt, gravity[3], pcg_iterations;
-    int64_t pcg_rest;
+    int64_t pcg_rest, order;  // order: nodes of the Cholesky ordering that follows the arrays
+    double order_flops;
 } tss__head;
 
 // The node arrays a checkpoint holds.
@@ -8880,6 +9155,8 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     size_t bytes[9], need = sizeof(tss__head);
     int count = tss__saved(w, list, bytes);
     for (int k = 0; k < count; k++) need += bytes[k];
+    int order = w->chol ? tss_chol_get_order(w->chol, NULL, NULL) : 0;
+    need += (size_t)order * sizeof(int);
     for (int k = 0; k < w->entry_count; k++)
         need += sizeof(uint64_t) + tss__energy_state(w, TSS__ENTRY(w, k), NULL, 0, 1);
     if (!data) return need;
@@ -8891,9 +9168,13 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     h.time = w->time, h.ah2 = w->ctx.ah2, h.dt = w->def.dt;
     h.pcg_iterations = w->pcg_iterations, h.pcg_rest = w->pcg_rest;
     memcpy(h.gravity, w->def.gravity, sizeof h.gravity);
+    h.order = order;
+    if (w->chol) tss_chol_get_order(w->chol, NULL, &h.order_flops);
     char *to = (char *)data;
     memcpy(to, &h, sizeof h), to += sizeof h;
     for (int k = 0; k < count; k++) memcpy(to, list[k]->p, bytes[k]), to += bytes[k];
+    if (order > 0) tss_chol_get_order(w->chol, (int *)(void *)to, NULL);
+    to += (size_t)order * sizeof(int);
     for (int k = 0; k < w->entry_count; k++) {
         uint64_t len = tss__energy_state(w, TSS__ENTRY(w, k), NULL, 0, 1);
         memcpy(to, &len, sizeof len), to += sizeof len;
@@ -8918,6 +9199,19 @@ static int tss__load_energies(tss_world *w, const char *from, size_t left, int r
     return left == 0;
 }
 
+// The ordering is what a Cholesky factorisation's bits depend on besides the matrix.
+static tss_result tss__load_order(tss_world *w, const char *from, int n, double flops) {
+    if (!w->chol && n == 0) return TSS_OK;
+    if (!w->chol) {
+        tss_chol_def d = tss_chol_def_default();
+        if (tss_chol_create(&w->host, &d, &w->chol) != TSS_OK) return TSS_ERROR_NO_MEMORY;
+    }
+    int *order = (int *)tss__need(&w->host, &w->scratch, (size_t)n, sizeof(int));
+    if (!order) return TSS_ERROR_NO_MEMORY;
+    memcpy(order, from, (size_t)n * sizeof(int));
+    return tss_chol_set_order(w->chol, n, w->dim, order, flops);
+}
+
 tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
     if (!w || !data) return TSS_ERROR_BAD_ARGUMENT;
     tss_result r = tss_world_prepare(w);
@@ -8936,8 +9230,14 @@ tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
                          "checkpoint: %llu nodes in %llu dimensions, %llu energies; the scene has %d, %d, %d",
                          (unsigned long long)h.n, (unsigned long long)h.dim, (unsigned long long)h.energies,
                          w->n, w->dim, w->entry_count);
+    if (h.order < 0 || h.order > w->n)
+        return tss__fail(w, TSS_ERROR_FORMAT, "checkpoint: an ordering of %lld nodes", (long long)h.order);
+    fixed += (size_t)h.order * sizeof(int);
     if (size < fixed || !tss__load_energies(w, (const char *)data + fixed, size - fixed, 0))
         return tss__fail(w, TSS_ERROR_FORMAT, "checkpoint: cut short or of another scene");
+    r = tss__load_order(w, (const char *)data + fixed - (size_t)h.order * sizeof(int), (int)h.order,
+                        h.order_flops);
+    if (r != TSS_OK) return tss__fail(w, r, "checkpoint: ordering: %s", tss_result_text(r));
     const char *from = (const char *)data + sizeof h;
     int kinds_change = memcmp(from + 7 * bytes[0], w->kind.p, bytes[7]) ||
                        memcmp(from + 7 * bytes[0] + bytes[7], w->axes.p, bytes[8]);
@@ -9078,6 +9378,7 @@ typedef struct tss__fd {
     tss__entry *e;
     double *x;
     int id, S;
+    double g_floor, h_floor;  // deviations are relative to at least these
 } tss__fd;
 
 static void tss__fd_batch(const tss__fd *f, double *value, double *gradient) {
@@ -9108,9 +9409,28 @@ static void tss__fd_stencil(const tss__fd *f, double step, const double *g, cons
             dh += c * c, hn += H[k * f->S + l] * H[k * f->S + l];
         }
     }
-    double size = tss__max(sqrt(gn), 1e-8 * sqrt(hn) * f->w->diagonal);
-    *eg = size > 0 ? sqrt(dg) / size : sqrt(dg);
-    *eh = hn > 0 ? sqrt(dh / hn) : sqrt(dh);
+    double gs = tss__max(sqrt(gn), f->g_floor), hs = tss__max(sqrt(hn), f->h_floor);
+    *eg = gs > 0 ? sqrt(dg) / gs : sqrt(dg);
+    *eh = hs > 0 ? sqrt(dh) / hs : sqrt(dh);
+}
+
+// A thousandth of the largest gradient and Hessian of all stencils: below it a stencil hardly
+// counts, and differences of its value only show their own truncation. Springs at rest have no
+// gradient at all: then 1e-8 of the Hessian times the scene's size.
+static void tss__fd_floors(tss__fd *f) {
+    double g[24], H[24 * 24], gm = 0, hm = 0;
+    for (f->id = 0; f->id < f->e->list.count; f->id++) {
+        double gn = 0, hn = 0;
+        tss_ids ids;
+        ids.first = f->id, ids.count = 1, ids.list = NULL;
+        f->e->def.gradient(f->e->def.user, &f->w->ctx, f->x, ids, g);
+        f->e->def.hessian(f->e->def.user, &f->w->ctx, f->x, ids, 0, H);
+        for (int k = 0; k < f->S; k++) gn += g[k] * g[k];
+        for (int k = 0; k < f->S * f->S; k++) hn += H[k] * H[k];
+        gm = tss__max(gm, gn), hm = tss__max(hm, hn);
+    }
+    f->h_floor = 1e-3 * sqrt(hm);
+    f->g_floor = tss__max(1e-3 * sqrt(gm), 1e-8 * sqrt(hm) * f->w->diagonal);
 }
 
 // Smallest eigenvalue of a symmetric matrix over its norm: −1e-k means it fails to be PSD by that.
@@ -9149,6 +9469,7 @@ tss_result tss_energy_check(tss_world *w, tss_energy id, tss_energy_report *out)
     tss__fd f;
     f.w = w, f.e = TSS__ENTRY(w, id), f.x = tss__f64(&w->x_trial), f.S = f.e->def.arity * w->dim;
     r = f.e->def.lists(f.e->def.user, &w->ctx, f.x, NULL, 0, &f.e->list);
+    if (r == TSS_OK) tss__fd_floors(&f);
     for (f.id = 0; r == TSS_OK && f.id < f.e->list.count; f.id++) {
         double g[24], H[24 * 24], eg = INFINITY, eh = INFINITY;
         tss_ids ids;
@@ -9339,3 +9660,27 @@ void tss_embedding_update(const tss_embedding *e, const tss_world *w, float *out
 #pragma GCC pop_options
 #endif
 #endif  // TSS_IMPLEMENTATION
+
+/*
+MIT License
+
+Copyright (c) 2026 The tss authors
+
+Permission is hereby granted, free of charge, to any person obtaining a copy
+of this software and associated documentation files (the "Software"), to deal
+in the Software without restriction, including without limitation the rights
+to use, copy, modify, merge, publish, distribute, sublicense, and/or sell
+copies of the Software, and to permit persons to whom the Software is
+furnished to do so, subject to the following conditions:
+
+The above copyright notice and this permission notice shall be included in all
+copies or substantial portions of the Software.
+
+THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR
+IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY,
+FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER
+LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM,
+OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
+SOFTWARE.
+*/

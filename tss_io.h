@@ -719,12 +719,20 @@ static int tss__io_int_text(tss__io *in, const char *what, int stop, long long *
     return 1;
 }
 
+// Turns the bytes of one number (1, 2, 4 or 8 of them) around.
+static void tss__io_swap(unsigned char *p, size_t bytes) {
+    uint64_t v = 0;
+    for (size_t i = 0; i < bytes; i++) v = v << 8 | p[i];
+    for (size_t i = 0; i < bytes; i++, v >>= 8) p[i] = (unsigned char)(v & 255);
+}
+
 // bytes raw bytes, in this machine's order, to `to`.
 static int tss__io_raw(tss__io *in, const char *what, size_t bytes, void *to) {
     unsigned char *out = (unsigned char *)to;
     if (tss__io_left(in) < bytes)
         return tss__io_fail(in, "expected %s (%d bytes), found end of file", what, (int)bytes);
-    for (size_t i = 0; i < bytes; i++) out[i] = in->at[in->swap ? bytes - 1 - i : i];
+    memcpy(out, in->at, bytes);
+    if (in->swap) tss__io_swap(out, bytes);
     in->at += bytes;
     return 1;
 }
@@ -733,12 +741,12 @@ static int tss__io_raw(tss__io *in, const char *what, size_t bytes, void *to) {
 static int tss__io_int(tss__io *in, const char *what, int bytes, long long *v) {
     if (!in->binary) return tss__io_next(in, what) && tss__io_int_text(in, what, 0, v);
     if (bytes == 4) {
-        int32_t i;
+        int32_t i = 0;
         if (!tss__io_raw(in, what, 4, &i)) return 0;
         *v = i;
         return 1;
     }
-    int64_t i;
+    int64_t i = 0;
     if (!tss__io_raw(in, what, 8, &i)) return 0;
     *v = i;
     return 1;
@@ -894,7 +902,7 @@ static int tss__gmsh_begin(tss__io *in, const tss__gmsh *g) {
 
 // The byte order shows in the number 1 after the format.
 static int tss__gmsh_endian(tss__io *in, const tss__gmsh *g) {
-    int32_t one;
+    int32_t one = 0;
     if (!g->binary) return 1;
     if (!tss__gmsh_begin(in, g) || !tss__io_raw(in, "the number 1", 4, &one)) return 0;
     if (one == 0x01000000)

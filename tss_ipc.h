@@ -1,9 +1,29 @@
-// ipcmath.h: the mathematics of tss_ipc.h (to be pasted into it: public part, then private part).
-#ifndef TSS_IPC_MATH_H
-#define TSS_IPC_MATH_H
+/* tss_ipc.h: contact and friction for tss.h, after Incremental Potential Contact (doc: see below)
+ *
+ * What it is: surfaces of a world's bodies repel each other within a distance d̂ by a logarithmic
+ * barrier, so strongly that they never meet; every Newton step is shortened by conservative
+ * continuous collision detection. Friction is Coulomb's, smoothed and lagged. Paper A, §3.1 and §4,
+ * uses this model; Li et al. 2020 introduced it.
+ *
+ *     #define TSS_IMPLEMENTATION            // in one .c or .cpp file
+ *     #include "tss.h"
+ *     #include "tss_ipc.h"
+ *
+ *     tss_ipc_def d = tss_ipc_def_default();
+ *     d.mu = 0.3;
+ *     tss_ipc_add(world, &d, NULL);         // before the first step; the world owns it
+ *
+ * Contact is two energies (barrier, friction) on the public hook of tss.h; the distances, the
+ * barrier and the collision detection below can be called on their own.
+ *
+ * Options: TSS_NO_SIMD  no intrinsics: plain loops, the same bits, a slower search
+ * Memory, threads, determinism, errors: as in tss.h. License: MIT (see the end of tss.h).
+ */
+#ifndef TSS_IPC_H
+#define TSS_IPC_H
 
 #ifndef TSS_H
-#error "include tss.h before this header"
+#error "include tss.h before tss_ipc.h"
 #endif
 
 #ifdef __cplusplus
@@ -86,13 +106,131 @@ TSS_API double tss_ipc_ccd(tss_ipc_kind kind, int dim, const double *x, const do
 TSS_API double tss_ipc_ccd_plane(int dim, const double *x, const double *d, const double *o,
                                  const double *n, double slack, double t_max);
 
+// ---------------------------------------------------------------------------------------------
+// >>contact (public)
+// Contact between all surfaces of a world: barrier and friction as two energies.
+//   tss_ipc_def d = tss_ipc_def_default();
+//   d.mu = 0.3;
+//   tss_ipc *contact;
+//   tss_ipc_add(world, &d, &contact);     // any time before tss_world_prepare or between steps
+// The world owns the object from then on; it lives until the world is destroyed or
+// tss_ipc_remove. Nothing intersects at the start, or tss_world_check says what does.
+//
+// Energy: κ Σ m b(d, d̂²) over all point–triangle and edge–edge pairs (3D) or point–edge pairs (2D)
+// nearer than d̂ that share no node, plus free points against free points and segments, plus
+// points against planes. A pair whose closest parts are a corner or an edge keeps its stencil, so
+// the same two points may count several times (once a pair of primitives): the plain sum is C¹,
+// and every weight is 1. IPC's merged lists with multiplicities have the same sum.
+// Friction: Σ μ λ f0(‖u‖), λ and the contact planes frozen ("lagged") at the start of a solve.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_ipc tss_ipc;
+
+// A half-space n·(x − o) >= 0 in which all surface points stay.
+typedef struct tss_ipc_plane {
+    double origin[3];
+    double normal[3];  // any length > 0, out of the solid
+    double mu;         // friction coefficient, >= 0
+} tss_ipc_plane;
+
+// What differs for one body.
+typedef struct tss_ipc_body {
+    tss_body body;
+    double mu;         // friction against anything; < 0: the default
+    int self_contact;  // 0: no contact of the body with itself; −1: the default
+} tss_ipc_body;
+
+// What differs for one pair of bodies (a == b: the body with itself). Goes before tss_ipc_body.
+typedef struct tss_ipc_pair {
+    tss_body a, b;
+    int exclude;  // 1: they pass through each other
+    double mu;    // < 0: as without this entry
+} tss_ipc_pair;
+
+typedef struct tss_ipc_def {
+    double dhat;      // d̂, m: surfaces nearer than this repel; 0: from dhat_rel. Default 0
+    double dhat_rel;  // d̂ = dhat_rel × diagonal, > 0; default 1e-3
+    double dhat_edge;  // with dhat_rel: d̂ <= dhat_edge × the shortest edge of a deformable surface,
+                       // so that neighbours in the mesh do not repel; 0: no bound. Default 0.5
+    double kappa;  // κ, J/m⁴ (b is in m⁴); 0: adaptive (the banner of the private part). Default 0
+    double mu;     // friction coefficient between bodies, >= 0; default 0
+    double eps_v;  // speed, m/s, below which friction is smoothed; 0: 1e-3 × diagonal / s
+    int friction_iterations;  // solves a step with friction updated in between, >= 1; default 1
+    int self_contact;         // default 1
+    double slack;        // a step leaves each pair at least this share of its distance, (0, 1);
+                         // default 0.2
+    int max_candidates;  // pairs kept at most (12 to 60 bytes each); a sweep that would have more
+                         // is shortened instead. >= 1; default 2^25
+    int planes;
+    const tss_ipc_plane *plane;  // copied
+    int bodies;
+    const tss_ipc_body *body;  // copied
+    int pairs;
+    const tss_ipc_pair *pair;  // copied
+    int cookie;
+} tss_ipc_def;
+
+TSS_API tss_ipc_def tss_ipc_def_default(void);
+// Errors: BAD_ARGUMENT (nothing is added), NO_MEMORY. out may be NULL.
+TSS_API tss_result tss_ipc_add(tss_world *w, const tss_ipc_def *def, tss_ipc **out);
+// Takes contact out of its world and frees it.
+TSS_API tss_result tss_ipc_remove(tss_ipc *p);
+
+// The values in use and what the last step cost. Before the first step (or tss_world_check) the
+// values that come from the scene are 0.
+typedef struct tss_ipc_info {
+    double dhat;            // m
+    const char *dhat_from;  // "given", "diagonal" or "shortest edge"
+    double kappa;           // κ, J/m⁴
+    double kappa_min, kappa_max;
+    double eps_v;         // m/s
+    int candidates;       // pairs of the last sweep whose boxes meet
+    int kept;             // of these, may come nearer than d̂
+    int active;           // pairs nearer than d̂ at the last state
+    int frictional;       // pairs with friction
+    double min_distance;  // at the last state, m; +inf: nothing nearer than d̂
+    int shortened;        // sweeps cut short by max_candidates since the start
+    int doubled;          // times κ was doubled since the start
+    size_t bytes;         // memory, the broad phase's trees not counted
+} tss_ipc_info;
+TSS_API void tss_ipc_get_info(const tss_ipc *p, tss_ipc_info *out);
+
+// One pair in contact at the world's current state. Forces are those of the last step: on the
+// first primitive; the second takes the opposite. A pair's node i takes coef[i] times them.
+typedef struct tss_ipc_contact {
+    int kind;            // tss_ipc_kind, or −1: a point and a plane
+    int node[4];         // world nodes, −1: none
+    int plane;           // kind −1: which, else −1
+    tss_body a, b;       // bodies of the two; b = −1 for a plane
+    double coef[4];      // closest points: Σ coef[i] x[node[i]] = distance · normal
+    double distance;     // m
+    double normal[3];    // from second to first
+    double force;        // along the normal, N, >= 0
+    double friction[3];  // N
+} tss_ipc_contact;
+// Writes at most max contacts and returns in *count how many there are (out NULL: only that).
+// Valid after a step. Errors: NOT_PREPARED, NO_MEMORY.
+TSS_API tss_result tss_ipc_contacts(tss_ipc *p, int max, tss_ipc_contact *out, int *count);
+// Force of contact and friction on each node, N (out: nodes × dim). The same state and errors.
+TSS_API tss_result tss_ipc_forces(tss_ipc *p, double *out);
+
+// Bodies that touch (nearer than d̂) and since when.
+typedef struct tss_ipc_touch {
+    tss_body a, b;  // a <= b; b = −1 − plane for a plane, listed with a the body
+    int began;      // 1: not yet so before the last step
+    int ended;      // 1: so before the last step and no more (force and distance are 0 then)
+    double force;   // sum of normal forces, N
+    double distance;
+} tss_ipc_touch;
+TSS_API tss_result tss_ipc_touches(tss_ipc *p, int max, tss_ipc_touch *out, int *count);
+
 #ifdef __cplusplus
 }
 #endif
-#endif  // TSS_IPC_MATH_H
+#endif  // TSS_IPC_H
 
-#if defined(TSS_IMPLEMENTATION) && !defined(TSS_IPC_MATH_DONE)
-#define TSS_IPC_MATH_DONE
+#if defined(TSS_IMPLEMENTATION) && !defined(TSS_IPC_IMPLEMENTATION_DONE)
+#define TSS_IPC_IMPLEMENTATION_DONE
 
 #include <float.h>
 #include <math.h>
@@ -452,7 +590,7 @@ static void tss__frame_hessian(const tss__frame *f, double k, double *H) {
     for (int i = 0; i < 4; i++)
         for (int j = 0; j < 4; j++)
             for (int a = 0; a < 3; a++)
-                H[(3 * i + a) * 12 + 3 * j + a] += 2 * k * f->c[i] * f->c[j];
+                H[(3 * i + a) * 12 + 3 * j + a] += 2 * k * (f->c[i] * f->c[j]);
     for (int p = 0; p < 2; p++) {
         double g[12];
         for (int i = 0; i < 4; i++)
@@ -1347,13 +1485,6 @@ static void tss__eight_hessian(const tss__eight *e, int psd) {
 #if !defined(__clang__) && defined(__GNUC__)
 #pragma GCC pop_options
 #endif
-#endif  // TSS_IPC_MATH_DONE
-
-#if defined(TSS_IMPLEMENTATION) && !defined(TSS__BROAD_ONCE)
-#define TSS__BROAD_ONCE
-// Broad phase section of tss_ipc.h: include after tss.h (TSS_IMPLEMENTATION defined).
-#ifndef TSS__BROAD_H
-#define TSS__BROAD_H
 
 #include <float.h>
 #include <limits.h>
@@ -1400,10 +1531,10 @@ static void tss__eight_hessian(const tss__eight *e, int psd) {
 // primitives a leaf. Its shape depends on the number of primitives only; which primitive lies in
 // which leaf comes from median splits along the longest side of the centroids' box, so clusters,
 // outliers and equal boxes cannot unbalance it. Later calls only recompute the boxes, until the
-// sum of their sizes has decayed. Upper boxes are floats rounded outward, leaves are doubles: the
-// pairs are exactly those whose double boxes meet. Eight queries of a leaf share a descent.
-// Cost: build n log n, refit n, search about n log n + pairs. Memory: 12 bytes a pair at the
-// high-water mark, below 300 bytes a primitive.
+// sum of their sizes has decayed. Upper boxes are floats, leaves are doubles: the pairs are exactly
+// those whose double boxes meet. Eight queries of a leaf share a descent.
+// Cost: build n log n, refit n, search about n log n + pairs. Memory: 12 bytes a pair and a
+// quarter to spare at the high-water mark, below 300 bytes a primitive.
 // Limits: fewer than 2^28 primitives of a kind; all nodes of a primitive belong to one body.
 // ---------------------------------------------------------------------------------------------
 
@@ -1441,7 +1572,7 @@ typedef struct tss__broad_leaf {
     int node[3][8];  // unused rows repeat row 0
 } tss__broad_leaf;
 
-// Eight children's boxes, outside those of the leaves below them.
+// Eight children's boxes.
 typedef struct tss__broad_node {
     float box[6][8];
     int child[8];  // a node, or ~leaf
@@ -1726,15 +1857,10 @@ static inline unsigned tss__broad_equal(const int *a, int v) {
 #endif
 }
 
-// A float below v, one above v, whatever the rounding: two units in the last place to spare; the
-// clamp keeps huge values finite and their order.
-static inline float tss__broad_below(double v) {
-    double c = v < -3e38 ? -3e38 : v > 3e38 ? 3e38 : v;
-    float f = (float)c;
-    return f - ((f < 0 ? -f : f) * 2.4e-7f + 1e-37f);
-}
-static inline float tss__broad_over(double v) {
-    return -tss__broad_below(-v);
+// To float. Rounding keeps order: boxes that meet as doubles meet as floats too, so that rounding
+// outward would only make them larger. The clamp, in order as well, keeps huge values finite.
+static inline float tss__broad_float(double v) {
+    return (float)(v < -3e38 ? -3e38 : v > 3e38 ? 3e38 : v);
 }
 
 // ---- topology ----
@@ -1976,7 +2102,7 @@ static void tss__broad_item_task(int block, int worker, void *arg) {
         double box[6];
         it->id = t->prim[n];
         tss__broad_prim_box(j->b->node_box, tss__broad_prim_nodes(t, it->id), t->arity, box);
-        for (int c = 0; c < 3; c++) it->c[c] = tss__broad_below(0.5 * box[c] + 0.5 * box[3 + c]);
+        for (int c = 0; c < 3; c++) it->c[c] = tss__broad_float(0.5 * box[c] + 0.5 * box[3 + c]);
     }
 }
 
@@ -2162,7 +2288,7 @@ static double tss__broad_lift_leaf(tss__broad_tree *t, int leaf, tss__broad_node
             lo = p < lo ? p : lo, hi = q > hi ? q : hi;
             sum += l->id[i] < 0 ? 0 : q - p;
         }
-        n->box[c][k] = tss__broad_below(lo), n->box[3 + c][k] = tss__broad_over(hi);
+        n->box[c][k] = tss__broad_float(lo), n->box[3 + c][k] = tss__broad_float(hi);
     }
     n->top[k] = top, n->group[k] = same;
     return sum;
@@ -2399,7 +2525,7 @@ static void tss__broad_leaf_query(const tss__broad_tree *t, int leaf, tss__broad
             lo = l->box[c][k] < lo ? l->box[c][k] : lo;
             hi = l->box[3 + c][k] > hi ? l->box[3 + c][k] : hi;
         }
-        q->f[c] = tss__broad_below(lo), q->f[3 + c] = tss__broad_over(hi);
+        q->f[c] = tss__broad_float(lo), q->f[3 + c] = tss__broad_float(hi);
     }
 }
 
@@ -2408,7 +2534,7 @@ static void tss__broad_lane_query(const tss__broad_tree *t, int leaf, int k, int
     const tss__broad_leaf *l = &t->leaf[leaf];
     for (int c = 0; c < 6; c++) {
         q->d[c] = l->box[c][k];
-        q->f[c] = c < 3 ? tss__broad_below(q->d[c]) : tss__broad_over(q->d[c]);
+        q->f[c] = tss__broad_float(q->d[c]);
     }
     for (int a = 0; a < 3; a++) q->node[a] = l->node[a][k];
     q->least = same ? l->id[k] : -1;
@@ -3128,146 +3254,6 @@ static double tss__broad_step(tss__broad *b, int kind, const tss__broad_pairs *i
 #if !defined(__clang__) && defined(__GNUC__)
 #pragma GCC pop_options
 #endif
-#endif  // TSS__BROAD_H
-#endif
-
-// ipcenergy.h: contact as two energies (to be pasted into tss_ipc.h after ipcmath.h and broad.h).
-#ifndef TSS_IPC_ENERGY_H
-#define TSS_IPC_ENERGY_H
-
-#ifndef TSS_IPC_MATH_H
-#error "include ipcmath.h before this header"
-#endif
-
-#ifdef __cplusplus
-extern "C" {
-#endif
-
-// ---------------------------------------------------------------------------------------------
-// >>contact (public)
-// Contact between all surfaces of a world: barrier and friction as two energies.
-//   tss_ipc_def d = tss_ipc_def_default();
-//   d.mu = 0.3;
-//   tss_ipc *contact;
-//   tss_ipc_add(world, &d, &contact);     // any time before tss_world_prepare or between steps
-// The world owns the object from then on; it lives until the world is destroyed or
-// tss_ipc_remove. Nothing intersects at the start, or tss_world_check says what does.
-//
-// Energy: κ Σ m b(d, d̂²) over all point–triangle and edge–edge pairs (3D) or point–edge pairs (2D)
-// nearer than d̂ that share no node, plus free points against free points and segments, plus
-// points against planes. A pair whose closest parts are a corner or an edge keeps its stencil, so
-// the same two points may count several times (once a pair of primitives): the plain sum is C¹,
-// and every weight is 1. IPC's merged lists with multiplicities have the same sum.
-// Friction: Σ μ λ f0(‖u‖), λ and the contact planes frozen ("lagged") at the start of a solve.
-// ---------------------------------------------------------------------------------------------
-
-typedef struct tss_ipc tss_ipc;
-
-// A half-space n·(x − o) >= 0 in which all surface points stay.
-typedef struct tss_ipc_plane {
-    double origin[3];
-    double normal[3];  // any length > 0, out of the solid
-    double mu;         // friction coefficient, >= 0
-} tss_ipc_plane;
-
-// What differs for one body.
-typedef struct tss_ipc_body {
-    tss_body body;
-    double mu;         // friction against anything; < 0: the default
-    int self_contact;  // 0: no contact of the body with itself; −1: the default
-} tss_ipc_body;
-
-// What differs for one pair of bodies (a == b: the body with itself). Goes before tss_ipc_body.
-typedef struct tss_ipc_pair {
-    tss_body a, b;
-    int exclude;  // 1: they pass through each other
-    double mu;    // < 0: as without this entry
-} tss_ipc_pair;
-
-typedef struct tss_ipc_def {
-    double dhat;      // d̂, m: surfaces nearer than this repel; 0: from dhat_rel. Default 0
-    double dhat_rel;  // d̂ = dhat_rel × diagonal, > 0; default 1e-3
-    double dhat_edge;  // with dhat_rel: d̂ <= dhat_edge × the shortest edge of a deformable surface,
-                       // so that neighbours in the mesh do not repel; 0: no bound. Default 0.5
-    double kappa;  // κ, J/m⁴ (b is in m⁴); 0: adaptive (the banner of the private part). Default 0
-    double mu;     // friction coefficient between bodies, >= 0; default 0
-    double eps_v;  // speed, m/s, below which friction is smoothed; 0: 1e-3 × diagonal / s
-    int friction_iterations;  // solves a step with friction updated in between, >= 1; default 1
-    int self_contact;         // default 1
-    double slack;        // a step leaves each pair at least this share of its distance, (0, 1);
-                         // default 0.2
-    int max_candidates;  // pairs kept at most (12 to 60 bytes each); a sweep that would have more
-                         // is shortened instead. >= 1; default 2^25
-    int planes;
-    const tss_ipc_plane *plane;  // copied
-    int bodies;
-    const tss_ipc_body *body;  // copied
-    int pairs;
-    const tss_ipc_pair *pair;  // copied
-    int cookie;
-} tss_ipc_def;
-
-TSS_API tss_ipc_def tss_ipc_def_default(void);
-// Errors: BAD_ARGUMENT (nothing is added), NO_MEMORY. out may be NULL.
-TSS_API tss_result tss_ipc_add(tss_world *w, const tss_ipc_def *def, tss_ipc **out);
-// Takes contact out of its world and frees it.
-TSS_API tss_result tss_ipc_remove(tss_ipc *p);
-
-// The values in use and what the last step cost. Before the first step (or tss_world_check) the
-// values that come from the scene are 0.
-typedef struct tss_ipc_info {
-    double dhat;            // m
-    const char *dhat_from;  // "given", "diagonal" or "shortest edge"
-    double kappa;           // κ, J/m⁴
-    double kappa_min, kappa_max;
-    double eps_v;         // m/s
-    int candidates;       // pairs of the last sweep whose boxes meet
-    int kept;             // of these, may come nearer than d̂
-    int active;           // pairs nearer than d̂ at the last state
-    int frictional;       // pairs with friction
-    double min_distance;  // at the last state, m; +inf: nothing nearer than d̂
-    int shortened;        // sweeps cut short by max_candidates since the start
-    int doubled;          // times κ was doubled since the start
-    size_t bytes;         // memory, the broad phase's trees not counted
-} tss_ipc_info;
-TSS_API void tss_ipc_get_info(const tss_ipc *p, tss_ipc_info *out);
-
-// One pair in contact at the world's current state. Forces are those of the last step: on the
-// first primitive; the second takes the opposite. A pair's node i takes coef[i] times them.
-typedef struct tss_ipc_contact {
-    int kind;            // tss_ipc_kind, or −1: a point and a plane
-    int node[4];         // world nodes, −1: none
-    int plane;           // kind −1: which, else −1
-    tss_body a, b;       // bodies of the two; b = −1 for a plane
-    double coef[4];      // closest points: Σ coef[i] x[node[i]] = distance · normal
-    double distance;     // m
-    double normal[3];    // from second to first
-    double force;        // along the normal, N, >= 0
-    double friction[3];  // N
-} tss_ipc_contact;
-// Writes at most max contacts and returns in *count how many there are (out NULL: only that).
-// Valid after a step. Errors: NOT_PREPARED, NO_MEMORY.
-TSS_API tss_result tss_ipc_contacts(tss_ipc *p, int max, tss_ipc_contact *out, int *count);
-// Force of contact and friction on each node, N (out: nodes × dim). The same state and errors.
-TSS_API tss_result tss_ipc_forces(tss_ipc *p, double *out);
-
-// Bodies that touch (nearer than d̂) and since when.
-typedef struct tss_ipc_touch {
-    tss_body a, b;  // a <= b; b = −1 − plane for a plane, listed with a the body
-    int began;      // 1: not yet so before the last step
-    int ended;      // 1: so before the last step and no more (force and distance are 0 then)
-    double force;   // sum of normal forces, N
-    double distance;
-} tss_ipc_touch;
-TSS_API tss_result tss_ipc_touches(tss_ipc *p, int max, tss_ipc_touch *out, int *count);
-
-#ifdef __cplusplus
-}
-#endif
-#endif  // TSS_IPC_ENERGY_H
-
-#if defined(TSS_IMPLEMENTATION) && !defined(TSS_IPC_ENERGY_DONE)
-#define TSS_IPC_ENERGY_DONE
 
 #include <stdio.h>
 
@@ -3286,8 +3272,9 @@ extern "C" {
 // >>contact_state (private)
 // Data flow of a Newton iterate:
 //   lists(x)        active pairs at x: filtered from the last sweep's if x lies on it, else found
-//   lists(x, d, t)  sweep of the broad phase; pairs that may come nearer than d̂ on it ("kept")
-//   max_step        additive CCD over the kept pairs
+//   lists(x, d, t)  sweep of the broad phase; pairs that may come nearer than d̂ on it ("kept");
+//                   additive CCD over them; again those on the part of the path that is free
+//   max_step        the step found there: nothing may be evaluated beyond it
 //   after_iterate   active pairs at the new state, their least distance, κ
 // A stencil keeps its nodes; which parts are closest is decided at each evaluation, so the energy
 // over any list that holds all pairs nearer than d̂ is the same sum.
@@ -3351,6 +3338,8 @@ struct tss_ipc {
     int count_old;
     uint64_t pattern;
     double t_cover;           // the sweep covers [0, t_cover] of what was asked
+    double t_step;            // largest collision-free step on it
+    int culprit[3];           // the pair that limits it: kind (−1: none) and its two numbers
     int swept;                // kept is valid on the path of the last sweep
     tss__ipc_array x_active;  // state that active belongs to
     int active_known;
@@ -3362,6 +3351,7 @@ struct tss_ipc {
 
     // κ
     double kappa, kappa_min, kappa_max;
+    int thin;                     // iterates in a row with a pair far inside d̂
     tss__ipc_array close;  // pairs below 1e-9 l at the last iterate: 5 ints and a distance
     int closes;
     tss__ipc_array work;
@@ -3613,17 +3603,57 @@ static tss_result tss__ipc_search(tss_ipc *p, const double *x, const double *d, 
 // Room for rounding where the filters of the broad phase decide: the evaluation decides exactly.
 #define TSS__IPC_REACH(p) ((p)->dhat * (1 + 1e-6))
 
-// kept = pairs that may come nearer than d̂ on x + s·d, s ∈ [0, t_cover].
+// Numbers of entry i of kind k: what the broad phase calls it, or plane and point.
+static void tss__ipc_entry(const tss__ipc_list *l, int k, int i, int key[3]) {
+    const int *q = (const int *)l->plane.p + 2 * (k == TSS__IPC_PLANE ? i : 0);
+    key[0] = k;
+    key[1] = k == TSS__IPC_PLANE ? q[1] : l->pair[k].pair[i].a;
+    key[2] = k == TSS__IPC_PLANE ? q[0] : l->pair[k].pair[i].b;
+}
+
+// The largest step up to t that leaves every kept pair its slack and every point its side.
+static double tss__ipc_limit(tss_ipc *p, const tss_ctx *c, const double *x, const double *d,
+                             double t) {
+    const tss__ipc_list *l = &p->kept;
+    p->culprit[0] = -1;
+    for (int k = 0; k < 4; k++) {
+        int who = -1;
+        double s = tss__broad_step(&p->broad, k, &l->pair[k], x, d, p->def.slack, t, &who);
+        if (s < t && who >= 0) tss__ipc_entry(l, k, who, p->culprit);
+        t = s < t ? s : t;
+    }
+    for (int i = 0; i < l->planes; i++) {
+        const int *v = (const int *)l->plane.p + 2 * i;
+        const tss_ipc_plane *q = &p->plane[v[1]];
+        size_t at = (size_t)v[0] * (size_t)c->dim;
+        double s = tss_ipc_ccd_plane(c->dim, x + at, d + at, q->origin, q->normal, p->def.slack, t);
+        if (s < t) t = s, tss__ipc_entry(l, TSS__IPC_PLANE, i, p->culprit);
+    }
+    return t;
+}
+
+// kept = the pairs of in that may come nearer than d̂ on x + s·d, s ∈ [0, t].
+static tss_result tss__ipc_keep(tss_ipc *p, const tss_ctx *c, const double *x, const double *d,
+                                double t, int again) {
+    tss_result r = TSS_OK;
+    for (int k = 0; k < 4 && r == TSS_OK; k++) {
+        tss__broad_pairs *in = again ? &p->kept.pair[k] : &p->broad.list[k];
+        r = tss__broad_reach(&p->broad, k, in, x, d, t, TSS__IPC_REACH(p), 0, &p->kept.pair[k]);
+        if (r == TSS_OK && !again && tss__ipc_excludes(p)) tss__ipc_exclude(p, k, &p->kept.pair[k]);
+    }
+    return r == TSS_OK ? tss__ipc_list_planes(p, c, x, d, t, &p->kept) : r;
+}
+
+// The sweep, the step it allows, and the stencils on the part of the path that can be taken: a step
+// cut short needs far fewer of them.
 static tss_result tss__ipc_sweep(tss_ipc *p, const tss_ctx *c, const double *x, const double *d,
                                  double t_max) {
     p->t_cover = t_max, p->swept = 0;
     tss_result r = tss__ipc_search(p, x, d, &p->t_cover);
-    for (int k = 0; k < 4 && r == TSS_OK; k++) {
-        r = tss__broad_reach(&p->broad, k, &p->broad.list[k], x, d, p->t_cover, TSS__IPC_REACH(p),
-                             0, &p->kept.pair[k]);
-        if (r == TSS_OK && tss__ipc_excludes(p)) tss__ipc_exclude(p, k, &p->kept.pair[k]);
-    }
-    if (r == TSS_OK) r = tss__ipc_list_planes(p, c, x, d, p->t_cover, &p->kept);
+    if (r == TSS_OK) r = tss__ipc_keep(p, c, x, d, p->t_cover, 0);
+    if (r != TSS_OK) return r;
+    p->t_step = tss__ipc_limit(p, c, x, d, p->t_cover);
+    if (p->t_step < 0.5 * p->t_cover) r = tss__ipc_keep(p, c, x, d, p->t_step, 1);
     p->swept = r == TSS_OK;
     return r;
 }
@@ -3808,28 +3838,23 @@ static void tss__ipc_hessian(void *user, const tss_ctx *c, const double *x, tss_
     tss__ipc_batch(p, c, x, ids, TSS__IPC_HESSIAN, psd, p->kappa, out);
 }
 
-// The largest step that leaves every kept pair its slack, and every point its side of the planes.
+// Found with the list. The culprit's place in it: lists ascend, and few steps are cut by planes.
 static double tss__ipc_max_step(void *user, const tss_ctx *c, const double *x, const double *d,
                                 double t_max, int *culprit) {
     tss_ipc *p = (tss_ipc *)user;
-    double t = t_max < p->t_cover ? t_max : p->t_cover;
     const tss__ipc_list *l = &p->kept;
+    (void)c, (void)x, (void)d;
     *culprit = -1;
     if (!p->swept) return 0;
-    for (int k = 0; k < 4; k++) {
-        int who = -1;
-        double s = tss__broad_step(&p->broad, k, &l->pair[k], x, d, p->def.slack, t, &who);
-        if (s < t && who >= 0) *culprit = l->start[k] + who;
-        t = s < t ? s : t;
+    if (t_max <= p->t_step) return t_max;
+    for (int k = p->culprit[0], i = k < 0 ? 0 : l->start[k]; k >= 0 && i < l->start[k + 1]; i++) {
+        int key[3];
+        tss__ipc_entry(l, k, i - l->start[k], key);
+        if (key[1] != p->culprit[1] || key[2] != p->culprit[2]) continue;
+        *culprit = i;
+        break;
     }
-    for (int i = 0; i < l->planes; i++) {
-        const int *v = (const int *)l->plane.p + 2 * i;
-        const tss_ipc_plane *q = &p->plane[v[1]];
-        size_t at = (size_t)v[0] * (size_t)c->dim;
-        double s = tss_ipc_ccd_plane(c->dim, x + at, d + at, q->origin, q->normal, p->def.slack, t);
-        if (s < t) t = s, *culprit = l->start[TSS__IPC_PLANE] + i;
-    }
-    return t;
+    return p->t_step;
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -3883,6 +3908,9 @@ static tss_result tss__ipc_start_kappa(tss_ipc *p, const tss_ctx *c) {
             cc += g[a] * g[a], ce -= g[a] * c->g[a];
     double k = cc > 0 ? ce / cc / c->ah2 : 0;
     if (!(k > p->kappa_min)) k = p->kappa_min;
+    // What the last step had to raise is kept while pairs are still near, else it fades.
+    double kept = p->min_distance < 0.2 * p->dhat ? before : 0.5 * before;
+    if (kept > k) k = kept;
     if (k > p->kappa_max) k = p->kappa_max;
     if (c->quasistatic && before > k) k = before;
     p->kappa = k > 0 ? k : 1;
@@ -3949,6 +3977,29 @@ static int tss__ipc_double_kappa(tss_ipc *p, const tss_ctx *c) {
     return 1;
 }
 
+// Pairs that stay far inside d̂ make Newton's method slow: the distance then changes by its own
+// size over a step that is tiny for everything else, and one tip can hold a whole body to steps of
+// 1 %. Three iterates in a row with a pair nearer than d̂/20 raise κ until the present force would be
+// held at d̂/10 (at most eightfold at once, never beyond κ_max). Tried on the mat that falls on
+// knives: 114 iterates a step without, 14 with. Doubling at 1e-9 l, IPC's own rule, comes too late.
+#define TSS__IPC_THIN 0.05
+
+// Barrier force for κ = 1 at a distance.
+static double tss__ipc_force_at(const tss_ipc *p, double distance) {
+    tss__barrier b = tss__barrier_of(distance * distance, p->dhat * p->dhat);
+    return 2 * distance * fabs(b.b1);
+}
+
+static int tss__ipc_stiffen(tss_ipc *p) {
+    p->thin = p->min_distance < TSS__IPC_THIN * p->dhat ? p->thin + 1 : 0;
+    if (p->def.kappa > 0 || p->thin < 3 || !(p->kappa < p->kappa_max)) return 0;
+    double ratio = tss__ipc_force_at(p, p->min_distance) / tss__ipc_force_at(p, 0.1 * p->dhat);
+    ratio = ratio < 2 ? 2 : ratio > 8 ? 8 : ratio;
+    p->kappa = ratio * p->kappa < p->kappa_max ? ratio * p->kappa : p->kappa_max;
+    p->thin = 0, p->doubled++;
+    return 1;
+}
+
 static int tss__ipc_after_iterate(void *user, const tss_ctx *c, const double *x0,
                                   const double *x1) {
     tss_ipc *p = (tss_ipc *)user;
@@ -3957,14 +4008,15 @@ static int tss__ipc_after_iterate(void *user, const tss_ctx *c, const double *x0
         p->failed = 1, p->active_known = 0;
         return 0;
     }
-    return tss__ipc_double_kappa(p, c);
+    int doubled = tss__ipc_double_kappa(p, c);
+    return tss__ipc_stiffen(p) || doubled;
 }
 
 // ---------------------------------------------------------------------------------------------
 // >>contact_friction (private)
 // D = Σ μ λ f0(‖u‖), u = (I − n nᵀ) Σ c_i (x_i − x_t,i); λ = κ m |∂b/∂distance|, n and c frozen.
 // u is the displacement since the start of the step for every integrator, its threshold ε_v h.
-// Hessian: c cᵀ ⊗ [f1/‖u‖ (I − n nᵀ − û ûᵀ) + f2 û ûᵀ]: positive semi-definite as it stands.
+// Hessian: c cᵀ ⊗ [f2 û ûᵀ + f1/‖u‖ (n × û)(n × û)ᵀ]: positive semi-definite as it stands.
 // ---------------------------------------------------------------------------------------------
 
 // Closest points of an active stencil at x: coefficients, normal, force λ per κ.
@@ -4030,11 +4082,8 @@ static int tss__ipc_any_friction(const tss_ipc *p) {
 
 // Kind and pair of a stencil: ascending along a list, so two lists can be merged.
 static void tss__ipc_key(const tss__ipc_list *l, int id, int key[3]) {
-    key[0] = tss__ipc_kind_of(l, id);
-    int i = id - l->start[key[0]];
-    const int *q = (const int *)l->plane.p + 2 * (key[0] == TSS__IPC_PLANE ? i : 0);
-    key[1] = key[0] == TSS__IPC_PLANE ? q[1] : l->pair[key[0]].pair[i].a;
-    key[2] = key[0] == TSS__IPC_PLANE ? q[0] : l->pair[key[0]].pair[i].b;
+    int k = tss__ipc_kind_of(l, id);
+    tss__ipc_entry(l, k, id - l->start[k], key);
 }
 
 // Freezes contact planes and normal forces at x.
@@ -4114,6 +4163,20 @@ static void tss__ipc_friction_gradient(void *user, const tss_ctx *c, const doubl
     }
 }
 
+// f2 û ûᵀ + f1/‖u‖ v vᵀ with v = n × û (2D: no v): a sum of squares, so rounding keeps it positive.
+static void tss__ipc_friction_matrix(int dim, const double *n, const double u[3], double y,
+                                     const double f[4], double M[9]) {
+    double a[3], b[3];
+    tss__v3 w = tss__v3_of(n[0], n[1], dim == 3 ? n[2] : 0), t = tss__v3_of(-w.y, w.x, 0), v;
+    if (dim == 3) tss__tangents_of(w, &t, &v);
+    if (dim == 3 && y > 0) t = tss__v3_of(u[0] / y, u[1] / y, u[2] / y);
+    v = tss__v3_cross(w, t);
+    tss__v3_store(t, a), tss__v3_store(v, b);
+    for (int i = 0; i < dim; i++)
+        for (int k = 0; k < dim; k++)
+            M[3 * i + k] = f[2] * (a[i] * a[k]) + (dim == 3 ? f[3] * (b[i] * b[k]) : 0);
+}
+
 static void tss__ipc_friction_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                       int psd, double *out) {
     const tss_ipc *p = (const tss_ipc *)user;
@@ -4124,15 +4187,10 @@ static void tss__ipc_friction_hessian(void *user, const tss_ctx *c, const double
         const double *q = (const double *)p->f_data.p + 8 * (size_t)id;
         double u[3], f[4], M[9], y = tss__ipc_slip(p, c, x, id, u);
         tss_ipc_friction(y, p->eps_v * c->h, f);
-        for (int a = 0; a < dim; a++)
-            for (int b = 0; b < dim; b++) {
-                double uu = y > 0 ? (u[a] / y) * (u[b] / y) : 0;
-                M[3 * a + b] =
-                    q[7] * (f[3] * ((a == b) - q[4 + a] * q[4 + b]) + (f[2] - f[3]) * uu);
-            }
+        tss__ipc_friction_matrix(dim, q + 4, u, y, f, M);
         for (int i = 0; i < ad; i++)
             for (int j = 0; j < ad; j++)
-                out[i * ad + j] = (q[i / dim] * q[j / dim]) * M[3 * (i % dim) + j % dim];
+                out[i * ad + j] = q[7] * (q[i / dim] * q[j / dim]) * M[3 * (i % dim) + j % dim];
     }
 }
 
@@ -4305,13 +4363,17 @@ static void tss__ipc_destroy(void *user, const tss_host *host) {
 // ---------------------------------------------------------------------------------------------
 // >>contact_doctor (private)
 // Intersections at x by a sweep along one axis over edges against triangles (3D) or edges against
-// edges (2D). Decided in floating point: a pair that touches within rounding may go either way.
+// edges (2D). Decided in floating point: a pair that only touches, within rounding, is let pass.
 // Cost: n log n and the overlaps along the axis; for tss_world_check only.
 // ---------------------------------------------------------------------------------------------
 
-// Six times the volume of a tetrahedron: > 0 if d lies on the side of (b − a) × (c − a).
-static double tss__ipc_volume(tss__v3 a, tss__v3 b, tss__v3 c, tss__v3 d) {
-    return tss__v3_dot(tss__v3_cross(tss__v3_sub(b, a), tss__v3_sub(c, a)), tss__v3_sub(d, a));
+// Side of the plane through a, b, c on which d lies: ±1, or 0 within the rounding of the volume
+// (three differences, products and sums: below 16 eps of the product of the sizes).
+static int tss__ipc_side(tss__v3 a, tss__v3 b, tss__v3 c, tss__v3 d) {
+    tss__v3 u = tss__v3_sub(b, a), v = tss__v3_sub(c, a), w = tss__v3_sub(d, a);
+    double volume = tss__v3_dot(tss__v3_cross(u, v), w);
+    double noise = 16 * DBL_EPSILON * tss__v3_sum_abs(u) * tss__v3_sum_abs(v) * tss__v3_sum_abs(w);
+    return volume > noise ? 1 : volume < -noise ? -1 : 0;
 }
 
 static tss__v3 tss__ipc_at(const tss_ctx *c, const double *x, int node) {
@@ -4322,22 +4384,17 @@ static tss__v3 tss__ipc_at(const tss_ctx *c, const double *x, int node) {
 static int tss__ipc_pierces(const tss_ctx *c, const double *x, const int *e, const int *t) {
     tss__v3 p = tss__ipc_at(c, x, e[0]), q = tss__ipc_at(c, x, e[1]);
     tss__v3 u = tss__ipc_at(c, x, t[0]), v = tss__ipc_at(c, x, t[1]), w = tss__ipc_at(c, x, t[2]);
-    double s = tss__ipc_volume(u, v, w, p), r = tss__ipc_volume(u, v, w, q);
-    if ((s > 0) == (r > 0)) return 0;
-    double a = tss__ipc_volume(p, q, u, v), b = tss__ipc_volume(p, q, v, w),
-           d = tss__ipc_volume(p, q, w, u);
-    return (a > 0 && b > 0 && d > 0) || (a < 0 && b < 0 && d < 0);
+    if (tss__ipc_side(u, v, w, p) * tss__ipc_side(u, v, w, q) >= 0) return 0;
+    int a = tss__ipc_side(p, q, u, v), b = tss__ipc_side(p, q, v, w);
+    return a != 0 && a == b && a == tss__ipc_side(p, q, w, u);
 }
 
 static int tss__ipc_crosses(const tss_ctx *c, const double *x, const int *e, const int *f) {
-    tss__v3 up = tss__v3_of(0, 0, 1), a = tss__ipc_at(c, x, e[0]), b = tss__ipc_at(c, x, e[1]);
+    tss__v3 a = tss__ipc_at(c, x, e[0]), b = tss__ipc_at(c, x, e[1]), up = {0, 0, 1};
     tss__v3 p = tss__ipc_at(c, x, f[0]), q = tss__ipc_at(c, x, f[1]);
-    tss__v3 ab = tss__v3_sub(b, a), pq = tss__v3_sub(q, p);
-    double s = tss__v3_dot(tss__v3_cross(ab, tss__v3_sub(p, a)), up),
-           r = tss__v3_dot(tss__v3_cross(ab, tss__v3_sub(q, a)), up);
-    double t = tss__v3_dot(tss__v3_cross(pq, tss__v3_sub(a, p)), up),
-           u = tss__v3_dot(tss__v3_cross(pq, tss__v3_sub(b, p)), up);
-    return s * r < 0 && t * u < 0;
+    tss__v3 over_a = tss__v3_add(a, 1, up), over_p = tss__v3_add(p, 1, up);
+    return tss__ipc_side(a, b, over_a, p) * tss__ipc_side(a, b, over_a, q) < 0 &&
+           tss__ipc_side(p, q, over_p, a) * tss__ipc_side(p, q, over_p, b) < 0;
 }
 
 typedef struct tss__ipc_span {
@@ -4385,11 +4442,11 @@ static int tss__ipc_intersections(tss_ipc *p, const tss_ctx *c, const double *x,
     int arity = c->dim, count = c->dim == 3 ? s->triangles : s->edges, found = 0, first = 0;
     const int *other = c->dim == 3 ? s->triangle : s->edge;
     tss__ipc_array memory = {NULL, 0};
-    tss__ipc_span *e = (tss__ipc_span *)tss__ipc_fit(p->host, &memory,
-                                                     (size_t)(s->edges + count) * sizeof *e),
-                  *f = e + s->edges;
+    tss__ipc_span *e =
+        (tss__ipc_span *)tss__ipc_fit(p->host, &memory, (size_t)(s->edges + count) * sizeof *e);
     double widest = 0;
     if (!e) return -1;
+    tss__ipc_span *f = e + s->edges;
     tss__ipc_spans(c, x, 0, s->edges, 2, s->edge, e);
     tss__ipc_spans(c, x, 0, count, arity, other, f);
     for (int i = 0; i < count; i++)
@@ -4763,4 +4820,28 @@ tss_result tss_ipc_touches(tss_ipc *p, int max, tss_ipc_touch *out, int *count) 
 #if !defined(__clang__) && defined(__GNUC__)
 #pragma GCC pop_options
 #endif
-#endif  // TSS_IPC_ENERGY_DONE
+#endif  // TSS_IMPLEMENTATION
+
+/*
+MIT License
+
+Copyright (c) 2026 The tss authors
+
+Permission is hereby granted, free of charge, to any person obtaining a copy
+of this software and associated documentation files (the "Software"), to deal
+in the Software without restriction, including without limitation the rights
+to use, copy, modify, merge, publish, distribute, sublicense, and/or sell
+copies of the Software, and to permit persons to whom the Software is
+furnished to do so, subject to the following conditions:
+
+The above copyright notice and this permission notice shall be included in all
+copies or substantial portions of the Software.
+
+THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR
+IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY,
+FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER
+LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM,
+OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
+SOFTWARE.
+*/

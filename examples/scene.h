@@ -92,7 +92,7 @@
 #ifndef SCENE_H
 #define SCENE_H
 
-#if !defined(TSS_H) || !defined(TSS_IPC_H) || !defined(TSS_IO_H) || !defined(TSS_SHAPES_H)
+#if !defined(TSS_H) || !defined(TSS_IO_H) || !defined(TSS_SHAPES_H)
 #error "include tss.h, tss_ipc.h, tss_io.h and tss_shapes.h before scene.h"
 #endif
 
@@ -143,8 +143,8 @@ typedef struct scene_body {
     double *rest;   // nodes × 3; NULL: mesh.x
     int obstacle, collider;  // collider: a script's meshCO
     tss_material material;
-    double damping, velocity[3], angular[3], mu;  // mu < 0: contact.mu
-    float color[3];                               // color[0] < 0: chosen by number
+    double velocity[3], angular[3], mu;  // mu < 0: contact.mu
+    float color[3];                      // color[0] < 0: chosen by number
     scene_pin *pin;
     scene_force *force;
     int pins, forces;
@@ -764,6 +764,44 @@ static int scene__load(scene__reader *r, const char *name, tss_mesh *out) {
                        r->assets ? "" : " (--assets DIR says where meshes are)");
 }
 
+static int scene__less_pair(const void *a, const void *b) {
+    const int *p = (const int *)a, *q = (const int *)b;
+    return p[0] != q[0] ? (p[0] > q[0]) - (p[0] < q[0]) : (p[1] > q[1]) - (p[1] < q[1]);
+}
+
+// 2D: the edges that belong to one triangle only, 2 × *count nodes.
+static int *scene__boundary_edges(const tss_mesh *m, int *count) {
+    int n = 3 * m->triangles, kept = 0;
+    int *pair = (int *)malloc(((size_t)n + 1) * 2 * sizeof *pair);
+    for (int k = 0; pair && k < n; k++) {
+        int a = m->triangle[k], b = m->triangle[k - k % 3 + (k + 1) % 3];
+        pair[2 * k] = a < b ? a : b, pair[2 * k + 1] = a < b ? b : a;
+    }
+    if (pair) qsort(pair, (size_t)n, 2 * sizeof *pair, scene__less_pair);
+    for (int k = 0; pair && k < n; k++) {
+        int twin = (k > 0 && scene__less_pair(pair + 2 * k, pair + 2 * k - 2) == 0) ||
+                   (k + 1 < n && scene__less_pair(pair + 2 * k, pair + 2 * k + 2) == 0);
+        if (!twin) memmove(pair + 2 * kept++, pair + 2 * k, 2 * sizeof *pair);
+    }
+    *count = kept;
+    return pair;
+}
+
+// 2D: replaces a mesh by its outline.
+static int scene__outline(tss_mesh *m) {
+    tss_mesh line;
+    int count, *edge = scene__boundary_edges(m, &count);
+    int ok = edge && tss_mesh_alloc(NULL, 2, m->nodes, 0, 0, count, 0, &line) == TSS_OK;
+    if (ok) {
+        memcpy(line.x, m->x, 3 * (size_t)m->nodes * sizeof *line.x);
+        memcpy(line.edge, edge, 2 * (size_t)count * sizeof *line.edge);
+        tss_mesh_free(m);
+        *m = line;
+    }
+    free(edge);
+    return ok;
+}
+
 typedef struct scene__region {
     double lower[3], upper[3];
     int metres;   // 0: 0..1 of the body's box
@@ -930,7 +968,7 @@ static int scene__read_scale(scene__reader *r, const cJSON *v, void *base) {
 static const scene__key scene__material_keys[] = {
     SCENE__ONE(scene_body, material.kind, "kind", scene__materials), SCENE__POS(scene_body, material.E, "E"),
     SCENE__NUM(scene_body, material.nu, "nu", -0.999, 0.4999), SCENE__POS(scene_body, material.rho, "rho"),
-    SCENE__NUM(scene_body, damping, "damping", 0, 1e300), SCENE__END};
+    SCENE__NUM(scene_body, material.damping, "damping", 0, 1e300), SCENE__END};
 
 static int scene__read_material(scene__reader *r, const cJSON *v, void *base) {
     return scene__read_object(r, v, scene__material_keys, base);  // b is the first member of a raw body
@@ -1080,6 +1118,8 @@ static int scene__body_mesh(scene__reader *r, scene__raw *w) {
         tss_mesh_free(m);
         *m = surface;
     }
+    if (w->b.obstacle && r->s->world.dim == 2 && m->triangles > 0 && !scene__outline(m))
+        return scene__fail(r->error, "out of memory");
     return tss_mesh_drop_unreferenced(m, NULL) == TSS_OK ? 1 : scene__fail(r->error, "out of memory");
 }
 
@@ -1786,7 +1826,7 @@ static int scene__place(scene__ipc *p) {
     for (int k = 0; k < s->bodies; k++) {
         scene_body *b = &s->body[k];
         b->material.kind = (tss_material_kind)p->energy;
-        b->damping = damping;
+        b->material.damping = damping;
         if (!(b->material.E > 0)) b->material.E = p->E, b->material.nu = p->nu, b->material.rho = p->density;
     }
     if (p->degrees != 0 && !scene__rotate_model(p)) return 0;
@@ -1877,29 +1917,6 @@ static int scene__world_fail(scene_error *e, const scene *s, const tss_world *w,
     return scene__fail(e, "%s: %s", s->file, why && why[0] ? why : tss_result_text(r));
 }
 
-static int scene__less_pair(const void *a, const void *b) {
-    const int *p = (const int *)a, *q = (const int *)b;
-    return p[0] != q[0] ? (p[0] > q[0]) - (p[0] < q[0]) : (p[1] > q[1]) - (p[1] < q[1]);
-}
-
-// 2D: the edges that belong to one triangle only. Returns 2 × *count nodes.
-static int *scene__outline(const tss_mesh *m, int *count) {
-    int n = 3 * m->triangles, kept = 0;
-    int *pair = (int *)malloc(((size_t)n + 1) * 2 * sizeof *pair);
-    for (int k = 0; pair && k < n; k++) {
-        int a = m->triangle[k], b = m->triangle[k - k % 3 + (k + 1) % 3];
-        pair[2 * k] = a < b ? a : b, pair[2 * k + 1] = a < b ? b : a;
-    }
-    if (pair) qsort(pair, (size_t)n, 2 * sizeof *pair, scene__less_pair);
-    for (int k = 0; pair && k < n; k++) {
-        int twin = (k > 0 && scene__less_pair(pair + 2 * k, pair + 2 * k - 2) == 0) ||
-                   (k + 1 < n && scene__less_pair(pair + 2 * k, pair + 2 * k + 2) == 0);
-        if (!twin) memmove(pair + 2 * kept++, pair + 2 * k, 2 * sizeof *pair);
-    }
-    *count = kept;
-    return pair;
-}
-
 // n × 3 → n × dim
 static double *scene__pack(const double *x, int n, int dim) {
     double *p = (double *)malloc(((size_t)n + 1) * (size_t)dim * sizeof *p);
@@ -1924,25 +1941,24 @@ static double *scene__velocities(const scene_body *b, int dim, int *ok) {
     return v;
 }
 
-static void scene__surface_def(const scene_body *b, int dim, int *outline, int outlines, tss_body_def *d) {
+static void scene__surface_def(const scene_body *b, tss_body_def *d) {
     d->kind = TSS_BODY_OBSTACLE;
-    d->triangles = dim == 3 ? b->mesh.triangles : 0, d->triangle = b->mesh.triangle;
-    d->segments = outline ? outlines : b->mesh.edges, d->segment = outline ? outline : b->mesh.edge;
+    d->triangles = b->mesh.triangles, d->triangle = b->mesh.triangle;
+    d->segments = b->mesh.edges, d->segment = b->mesh.edge;
     d->points = b->mesh.points, d->point = b->mesh.point;
 }
 
 static int scene__add_to_world(const scene *s, scene_body *b, tss_world *w, scene_error *e) {
-    int dim = s->world.dim, outlines = 0, ok, *outline = NULL;
+    int dim = s->world.dim, ok;
     tss_body_def d = tss_body_def_default();
     tss_body_info info;
     double *X = scene__pack(b->rest ? b->rest : b->mesh.x, b->mesh.nodes, dim);
     double *x = scene__pack(b->mesh.x, b->mesh.nodes, dim), *v = scene__velocities(b, dim, &ok);
-    if (b->obstacle && dim == 2 && b->mesh.triangles > 0) outline = scene__outline(&b->mesh, &outlines);
     d.name = b->name, d.nodes = b->mesh.nodes, d.X = X, d.x0 = x, d.v0 = v;
-    d.material = b->material, d.damping = b->damping;
+    d.material = b->material;
     memcpy(d.velocity, b->velocity, sizeof d.velocity);
     if (b->obstacle) {
-        scene__surface_def(b, dim, outline, outlines, &d);
+        scene__surface_def(b, &d);
     } else {
         d.cells = dim == 3 ? b->mesh.tets : b->mesh.triangles;
         d.cell = dim == 3 ? b->mesh.tet : b->mesh.triangle;
@@ -1950,7 +1966,7 @@ static int scene__add_to_world(const scene *s, scene_body *b, tss_world *w, scen
     tss_result r = X && x && ok ? tss_body_add(w, &d, &b->id) : TSS_ERROR_NO_MEMORY;
     if (r == TSS_OK) r = tss_body_get(w, b->id, &info);
     if (r == TSS_OK) b->first = info.first_node;
-    free(X), free(x), free(v), free(outline);
+    free(X), free(x), free(v);
     return r == TSS_OK ? 1 : scene__world_fail(e, s, w, r);
 }
 

@@ -213,9 +213,10 @@ static double now(void *ctx) {
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
-static void print_log(tss_log_level level, const char *message, void *ctx) {
+// Errors come back as results.
+static void print_log(tss_log_level level_, const char *message, void *ctx) {
     (void)ctx;
-    if (level != TSS_LOG_INFO) fprintf(stderr, "tss: %s\n", message);
+    if (level_ == TSS_LOG_WARNING) fprintf(stderr, "tss: %s\n", message);
 }
 
 static int fail(run *r, const char *format, ...) {

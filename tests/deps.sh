@@ -2,9 +2,9 @@
 # Installs what the examples and tests need and is missing. Says what it did.
 set -eu
 
-apt_packages="gcc g++ make libopenblas-serial-dev liblapacke-dev libmetis-dev libcjson-dev libpng-dev libcmocka-dev"
-dnf_packages="gcc gcc-c++ make openblas-devel lapack-devel metis-devel cjson-devel libpng-devel libcmocka-devel"
-brew_packages="openblas metis cjson libpng cmocka libomp"
+apt_packages="gcc g++ make libmetis-dev libcjson-dev libpng-dev libcmocka-dev"
+dnf_packages="gcc gcc-c++ make metis-devel cjson-devel libpng-devel libcmocka-devel"
+brew_packages="metis cjson libpng cmocka libomp"
 
 sudo=
 [ "$(id -u)" = 0 ] || sudo=sudo

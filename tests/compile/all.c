@@ -1,0 +1,6 @@
+// Every header in one translation unit, as the unit that carries the implementation.
+#define TSS_IMPLEMENTATION
+#include "tss.h"
+#include "tss_ipc.h"
+#include "tss_io.h"
+#include "tss_shapes.h"

@@ -1,0 +1,154 @@
+#!/bin/sh
+# Runs the tests and ends with `N passed, N failed`.
+#   tests/run.sh BUILD             everything
+#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|unit   one part
+# Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
+set -u
+build=$1
+part=${2:-all}
+cc=${CC:-cc}
+data=${TSS_DATA:-../shared/data}
+passed=0
+failed=0
+log=$build/log
+mkdir -p "$build" "$log"
+
+warn="-Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wsign-conversion"
+inc="-I. -Iexamples -Itests"
+none="-DTSS_NO_OPENMP -DTSS_NO_LAPACK -DTSS_NO_METIS -DTSS_NO_SIMD"
+
+if [ -d "$data" ]; then
+    export TSS_DATA="$data" TSS_TEST_DATA="$data" TSS_CCD_DATA="$data/ccd"
+fi
+
+ok()  { passed=$((passed + 1)); printf 'ok      %s\n' "$1"; }
+bad() { failed=$((failed + 1)); printf 'FAILED  %s\n' "$1"; [ -z "${2:-}" ] || tail -n 15 "$2" | sed 's/^/        /'; }
+
+# check NAME COMMAND...: one test that passes if the command does.
+check() {
+    name=$1; shift
+    out="$log/$(echo "$name" | tr -c 'A-Za-z0-9_\n' _).log"
+    if "$@" >"$out" 2>&1; then ok "$name"; else bad "$name" "$out"; fi
+}
+
+# suite NAME PROGRAM [ARG...]: a cmocka program; its tests are counted one by one.
+suite() {
+    name=$1; shift
+    out="$log/$(echo "$name" | tr -c 'A-Za-z0-9_\n' _).log"
+    CMOCKA_MESSAGE_OUTPUT=TAP "$@" >"$out" 2>&1
+    code=$?
+    p=$(grep -c '^ok ' "$out"); f=$(grep -c '^not ok ' "$out")
+    [ "$code" = 0 ] || [ "$f" -gt 0 ] || f=1
+    [ "$((p + f))" -gt 0 ] || f=1
+    passed=$((passed + p)); failed=$((failed + f))
+    if [ "$f" = 0 ]; then printf 'ok      %s (%d)\n' "$name" "$p"
+    else printf 'FAILED  %s (%d of %d)\n' "$name" "$f" "$((p + f))"; grep -v '^ok ' "$out" | tail -n 15 | sed 's/^/        /'; fi
+}
+
+libs() { case "$1" in *NO_METIS*) ;; *) printf -- '-lmetis ';; esac; printf -- '-lm'; }
+
+# variant NAME FLAGS TEST...: builds and runs test programs with other flags.
+variant() {
+    name=$1; flags=$2; shift 2
+    for t in "$@"; do
+        exe="$build/${t}_$name"
+        # shellcheck disable=SC2086
+        if $cc -std=c11 -O1 -g $warn $inc $flags "tests/$t.c" -o "$exe" -lcmocka -lcjson -lpng $(libs "$flags") -lpthread \
+            >"$log/${t}_$name.build" 2>&1 && [ ! -s "$log/${t}_$name.build" ]
+        then suite "$t [$name]" "$exe"; else bad "$t [$name] does not build without a warning" "$log/${t}_$name.build"; fi
+    done
+}
+
+core_tests="test_core test_linalg test_ipcworld"
+
+unit() {
+    for exe in "$build"/test_*; do
+        case $(basename "$exe") in *\[*|*_no_*|*_asan|*_tsan|*_serial|*_nothing) continue;; esac
+        [ -x "$exe" ] && suite "$(basename "$exe")" "$exe"
+    done
+}
+
+checkers() {
+    [ -d "$data" ] || return 0
+    check "contact reference" "$build/contact_reference" "$data/contact/reference.csv"
+    check "ccd queries" "$build/ccd_queries" "$data"/ccd/*.csv
+}
+
+nodeps() {
+    variant no_openmp "-fno-openmp -DTSS_NO_OPENMP" test_core
+    variant no_lapack "-fopenmp -DTSS_NO_LAPACK" test_linalg
+    variant no_metis "-fopenmp -DTSS_NO_METIS" test_linalg
+    # shellcheck disable=SC2086
+    variant nothing "$none" $core_tests
+}
+
+# What someone does who copies the headers into an empty folder.
+compat() {
+    dir=$build/empty
+    rm -rf "$dir"; mkdir -p "$dir"
+    cp tss.h tss_ipc.h examples/01_hello.c "$dir"
+    bare="-DTSS_NO_OPENMP -DTSS_NO_LAPACK -DTSS_NO_METIS"
+    # shellcheck disable=SC2086
+    (cd "$dir" && check_in_dir() { :; }
+     $cc $bare 01_hello.c -lm -o hello) >"$log/hello.build" 2>&1 && ok "hello in an empty folder" ||
+        bad "hello in an empty folder" "$log/hello.build"
+    check "hello runs" "$dir/hello"
+    cp examples/01_hello.c "$dir/hello.cpp"
+    # shellcheck disable=SC2086
+    (cd "$dir" && c++ -std=c++17 $bare hello.cpp -lm -o hellopp) >"$log/hellopp.build" 2>&1 && ok "hello as C++" ||
+        bad "hello as C++" "$log/hellopp.build"
+    for comp in gcc clang g++ clang++; do
+        command -v $comp >/dev/null 2>&1 || continue
+        case $comp in *++) std="-std=c++17 -x c++" ;; *) std=-std=c11 ;; esac
+        # shellcheck disable=SC2086
+        if $comp $std -O1 $warn -Werror $inc -fsyntax-only tests/compile/all.c >"$log/compile_$comp.log" 2>&1
+        then ok "all headers, $comp, no warning"; else bad "all headers, $comp, no warning" "$log/compile_$comp.log"; fi
+    done
+    # Two translation units, one implementation; nothing unprefixed leaves it.
+    # shellcheck disable=SC2086
+    if $cc -std=c11 -O1 $inc $none -c tests/compile/all.c -o "$build/tu_impl.o" 2>"$log/tu.log" &&
+       $cc -std=c11 -O1 $inc $none -c tests/compile/user.c -o "$build/tu_user.o" 2>>"$log/tu.log" &&
+       $cc "$build/tu_impl.o" "$build/tu_user.o" -lm -o "$build/tu" 2>>"$log/tu.log" && "$build/tu" >>"$log/tu.log"
+    then ok "two translation units"; else bad "two translation units" "$log/tu.log"; fi
+    nm --defined-only --extern-only "$build/tu_impl.o" | awk '{print $3}' | grep -v '^tss_' >"$log/nm.log"
+    if [ -s "$log/nm.log" ]; then bad "only tss_ symbols are exported" "$log/nm.log"; else ok "only tss_ symbols are exported"; fi
+}
+
+sanitize() {
+    # shellcheck disable=SC2086
+    variant asan "-fsanitize=address,undefined -fno-sanitize-recover=undefined $none" $core_tests test_elastic
+    variant tsan "-fsanitize=thread -DTSS_NO_OPENMP -DTSS_NO_LAPACK -DTSS_NO_METIS -DTSS_NO_SIMD" test_threads
+}
+
+fuzz() {
+    command -v clang >/dev/null 2>&1 || { echo "fuzz: needs clang"; return 0; }
+    for f in tests/fuzz/*.c; do
+        name=$(basename "$f" .c)
+        # shellcheck disable=SC2086
+        if clang -g -O1 -fsanitize=fuzzer,address,undefined $inc $none "$f" -o "$build/$name" -lm >"$log/$name.build" 2>&1
+        then mkdir -p "$build/corpus_$name"; check "fuzz $name 60 s" "$build/$name" -max_total_time=60 "$build/corpus_$name"
+        else bad "fuzz $name does not build" "$log/$name.build"; fi
+    done
+}
+
+# Scenes from start to end under the independent checker: no intersection, no inversion, targets met.
+scenes() {
+    for s in tests/data/*.json; do
+        [ -f "$s" ] && check "scene $(basename "$s" .json)" "$build/tss" run "$s" -o "$build/scene_out" --check
+    done
+    [ -d "$data/ipc/scenes" ] || return 0
+    for s in 10_tetTet 10_cubeStack 12_largeMassRatio sqp_04_pointTriangle sqp_05_edgeEdge sqp_09_tetCube \
+             sqp_10_alignedTetCube sqp_12_alignedCubes sqp_14_fiveCubeStack erleben_cubeCliffCO \
+             erleben_spikeSpikeCO erleben_wedgeCrackCO rodsTwist_E1e4_dt2; do
+        [ -f "$data/ipc/scenes/$s.txt" ] || continue
+        check "scene $s" "$build/tss" run "$data/ipc/scenes/$s.txt" --assets "$data/ipc" --steps 30 \
+            -o "$build/scene_out" --check
+    done
+}
+
+case $part in
+all) unit; checkers; scenes; nodeps; compat; sanitize ;;
+*) $part ;;
+esac
+printf '%d passed, %d failed\n' "$passed" "$failed"
+[ "$failed" = 0 ]
