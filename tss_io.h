@@ -720,7 +720,7 @@ static int tss__io_int_text(tss__io *in, const char *what, int stop, long long *
 }
 
 // Turns the bytes of one number (1, 2, 4 or 8 of them) around.
-static void tss__io_swap(unsigned char *p, size_t bytes) {
+static void tss__io_turn(unsigned char *p, size_t bytes) {
     uint64_t v = 0;
     for (size_t i = 0; i < bytes; i++) v = v << 8 | p[i];
     for (size_t i = 0; i < bytes; i++, v >>= 8) p[i] = (unsigned char)(v & 255);
@@ -732,7 +732,7 @@ static int tss__io_raw(tss__io *in, const char *what, size_t bytes, void *to) {
     if (tss__io_left(in) < bytes)
         return tss__io_fail(in, "expected %s (%d bytes), found end of file", what, (int)bytes);
     memcpy(out, in->at, bytes);
-    if (in->swap) tss__io_swap(out, bytes);
+    if (in->swap) tss__io_turn(out, bytes);
     in->at += bytes;
     return 1;
 }
