@@ -1029,7 +1029,7 @@ static int tss__gmsh_totals(tss__io *in, const tss__gmsh *g, const char *what, l
 
 static int tss__gmsh_nodes4(tss__io *in, tss__gmsh *g) {
     long long blocks, total, n, tag;
-    int dim, entity, parametric;
+    int dim = 0, entity, parametric;
     if (!tss__gmsh_totals(in, g, "nodes", &blocks, &total)) return 0;
     for (long long b = 0; b < blocks; b++) {
         if (!tss__gmsh_block(in, g, "the flag 'parametric'", &dim, &entity, &parametric, &n) ||
@@ -1154,7 +1154,7 @@ static int tss__gmsh_elements2(tss__io *in, tss__gmsh *g) {
 
 static int tss__gmsh_elements4(tss__io *in, tss__gmsh *g) {
     long long blocks, total, n, number, done = 0;
-    int dim, entity, type, kind;
+    int dim = 0, entity, type, kind;
     if (!tss__gmsh_totals(in, g, "elements", &blocks, &total)) return 0;
     for (long long b = 0; b < blocks; b++) {
         if (!tss__gmsh_block(in, g, "an element's type", &dim, &entity, &type, &n) ||

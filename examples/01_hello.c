@@ -14,7 +14,7 @@ static int cell[CELLS * 4];
 
 static int node(int i, int j, int k) { return (i * (N + 1) + j) * (N + 1) + k; }
 
-// A cube of side 0.5 m, 0.3 m above the ground: N³ small cubes of six tets, each a way along their edges.
+// A cube of side 0.5 m, 0.3 m up: N³ small cubes of six tets, each a way along their edges.
 static void build_cube(void) {
     static const int way[6][3] = {{0, 1, 2}, {1, 2, 0}, {2, 0, 1}, {1, 0, 2}, {0, 2, 1}, {2, 1, 0}};
     for (int k = 0; k < NODES; k++) {

@@ -1,24 +1,24 @@
 /* scene.h: scenes in words (for the example programs; needs cJSON)
 
-   #define SCENE_IMPLEMENTATION       // in one .c file, after tss.h, tss_ipc.h, tss_io.h, tss_shapes.h
+   #define SCENE_IMPLEMENTATION    // in one .c file, after tss.h, tss_ipc.h, tss_io.h, tss_shapes.h
    #include "scene.h"
 
    scene s;
    scene_error why;
-   if (!scene_read(&s, "drop.json", NULL, NULL, 0, &why)) return fprintf(stderr, "%s\n", why.text), 2;
-   tss_host host = tss_host_default();
+   if (!scene_read(&s, "drop.json", NULL, NULL, 0, &why)) fprintf(stderr, "%s\n", why.text);
    tss_world *w;
-   if (!scene_build(&s, &host, &w, &why)) ...        // bodies, contact, pins
+   tss_ipc *contact;
+   if (!scene_build(&s, NULL, NULL, NULL, &w, &contact, &why)) ...   // bodies, contact, pins
    for (int k = 0; k < s.world.steps; k++) {
-       scene_drive(&s, w, &why);                      // targets and forces of the step to come
+       scene_drive(&s, w, &why);    // targets and forces of the step to come
        tss_world_step(w, NULL);
    }
    tss_world_destroy(w);
    scene_free(&s);
 
    Two languages, one struct: JSON (a file whose first character is '{'), and the scripts of the IPC
-   reference code (anything else). A key that is not listed here is refused by name. Lengths in metres,
-   angles in degrees, y is up. Vectors are [x, y, z], in 2D also [x, y].
+   reference code (anything else). A key that is not listed here is refused by name. Lengths in
+   metres, angles in degrees, y is up. Vectors are [x, y, z], in 2D also [x, y].
 
    KEYS OF A JSON SCENE (default)
    world.dim               2 or 3 (3)
@@ -35,25 +35,25 @@
    contact.enabled         bodies touch (true)
    contact.dhat            distance at which contact begins, m (0: use dhat_rel)
    contact.dhat_rel        the same over the diagonal (1e-3)
-   contact.dhat_edge       with dhat_rel: at most this share of a soft surface's shortest edge (0.5)
+   contact.dhat_edge       with dhat_rel: at most this share of the shortest surface edge (0.5)
    contact.mu              friction where nothing else is said (0)
    contact.eps_v           slower than this sticks, m/s (0: use eps_v_rel)
    contact.eps_v_rel       the same over the diagonal, 1/s (1e-3)
    contact.kappa           barrier stiffness (0: adapts)
-   contact.friction_iterations  solves a step for the lagged friction (1)
+   contact.friction_iterations   solves a step for the lagged friction (1)
    contact.self            a body touches itself (true)
    bodies[]                soft bodies and obstacles
     .name                  for messages (mesh or shape, and number)
-    .mesh                  file: .msh .mesh .node .obj .ply .seg; beside the scene or under --assets
+    .mesh                  file: .msh .mesh .node .obj .ply .seg; beside the scene, under --assets
     .shape                 instead of mesh, see below
     .scale .rotate .translate   number or vector (1); Rx Ry Rz, degrees; m. In this order
     .obstacle              its surface moves as told (false); surfaces, segments, points must be
     .material              {kind, E, nu, rho, damping}: neo_hookean | stable_neo_hookean |
                            fixed_corotated | stvk | linear (neo_hookean), Pa (1e5), (0.4),
                            kg/m³ (1000), stiffness-proportional damping time, s (0)
-    .velocity .angular_velocity  at the start, m/s and degrees/s about the middle of its box
+    .velocity .angular_velocity   at the start, m/s, and degrees/s about the middle of its box
     .pins[]                {lower, upper: box, 0..1 of the body's; metres: true: in metres;
-                           axes: "xyz"; motion; release: let go at the motion's end (false)}
+                           axes: "xyz"; motion; release: free outside the motion's time (false)}
     .forces[]              {lower, upper, metres; force: total, N; acceleration: m/s²; start, end}
     .motion                of an obstacle, or of a whole soft body
     .mu                    friction of this body (contact.mu)
@@ -80,15 +80,17 @@
                            range: [low, high], wireframe: 0..1 (0)}
    run                     {check (false), every (1), budget_ms (0), frames: "png,vtu,obj" ("")}
 
-   IPC SCRIPTS  time density stiffness energy timeIntegration dampingStiff dampingRatio turnOffGravity
-   dHat epsv tuning fricIterAmt tol size rotateModel halfSpace ground meshCO shapes shapeMatrix
-   selfCollisionOn selfCollisionOff selfFric section script; view zoom cameraTracking playBackSpeed
-   warmStart constraintSolver are skipped with a warning. Differences: rotations of moving things are
-   exact, not composed step by step; the stiffness of friction cones, obstacles and half-spaces is
-   found by tss.
+   IPC SCRIPTS  time density stiffness energy timeIntegration dampingStiff dampingRatio
+   turnOffGravity dHat epsv tuning fricIterAmt tol size rotateModel halfSpace ground meshCO shapes
+   shapeMatrix selfCollisionOn selfCollisionOff selfFric section script; view zoom cameraTracking
+   playBackSpeed warmStart constraintSolver are skipped with a warning. Differences: rotations of
+   moving things are exact, not composed step by step; barrier stiffness is always found by tss.
 
-   ERRORS  Functions return 1, or 0 and a sentence that names file, key or line and what was expected.
-   MEMORY  malloc. THREADS  One scene, one thread.                                                 */
+   ERRORS  Functions return 1, or 0 and a sentence: file, key or line, and what was expected.
+   MEMORY  malloc. THREADS  One scene, one thread.
+
+   >>scene  >>scene_tools  >>scene_keys  >>scene_meshes  >>scene_json  >>scene_script
+   >>scene_build  >>scene_drive                                                                   */
 #ifndef SCENE_H
 #define SCENE_H
 
@@ -116,7 +118,7 @@ typedef struct scene_keyframe {
     double time, translate[3], rotate[3];  // s, m, rad (vector along the axis)
 } scene_keyframe;
 
-// A rigid motion: from + velocity · τ, turned by angular · τ about pivot; τ runs from start to end.
+// A rigid motion: velocity · τ, and a turn of angular · τ about pivot; τ runs from start to end.
 typedef struct scene_motion {
     int moves;  // 0: there is none
     double start, end, velocity[3], angular[3], pivot[3];
@@ -127,8 +129,8 @@ typedef struct scene_motion {
 
 typedef struct scene_pin {
     int *node, nodes;  // of the body
-    unsigned axes;  // bit c: coordinate c
-    int release;    // free before the motion's start and after its end
+    unsigned axes;     // bit c: coordinate c
+    int release;       // free before the motion's start and after its end
     scene_motion motion;
 } scene_pin;
 
@@ -139,8 +141,8 @@ typedef struct scene_force {
 
 typedef struct scene_body {
     char name[80];
-    tss_mesh mesh;  // x: positions at the start
-    double *rest;   // nodes × 3; NULL: mesh.x
+    tss_mesh mesh;           // x: positions at the start
+    double *rest;            // nodes × 3; NULL: mesh.x
     int obstacle, collider;  // collider: a script's meshCO
     tss_material material;
     double velocity[3], angular[3], mu;  // mu < 0: contact.mu
@@ -157,10 +159,19 @@ typedef struct scene_plane {
     double origin[3], normal[3], mu;
 } scene_plane;
 
-typedef enum scene_field { SCENE_FIELD_NONE, SCENE_FIELD_J, SCENE_FIELD_VELOCITY, SCENE_FIELD_STRAIN } scene_field;
+typedef enum scene_field {
+    SCENE_FIELD_NONE,
+    SCENE_FIELD_J,
+    SCENE_FIELD_VELOCITY,
+    SCENE_FIELD_STRAIN
+} scene_field;
 typedef enum scene_script {
-    SCENE_SCRIPT_NONE, SCENE_SCRIPT_FALL, SCENE_SCRIPT_DRAGRIGHT, SCENE_SCRIPT_TWIST,
-    SCENE_SCRIPT_STRETCH, SCENE_SCRIPT_SQUASH
+    SCENE_SCRIPT_NONE,
+    SCENE_SCRIPT_FALL,
+    SCENE_SCRIPT_DRAGRIGHT,
+    SCENE_SCRIPT_TWIST,
+    SCENE_SCRIPT_STRETCH,
+    SCENE_SCRIPT_SQUASH
 } scene_script;
 
 // Nodes that move as told, and how far they have come.
@@ -211,8 +222,8 @@ typedef struct scene {
     char *forces_on;  // one a force, in the order of the bodies
 } scene;
 
-// assets: where mesh files are looked for first (NULL: beside the scene). set: "key=value" lines, as in
-// "world.dt=0.02" or "bodies.0.material.E=1e6", that replace what the file says.
+// assets: where mesh files are looked for first (NULL: beside the scene). set: "key=value" lines,
+// as in "world.dt=0.02" or "bodies.0.material.E=1e6", that replace what the file says.
 SCENE_API int scene_read(scene *s, const char *path, const char *assets, const char *const *set,
                          int sets, scene_error *error);
 // The same from memory; name stands for the file in messages.
@@ -220,7 +231,7 @@ SCENE_API int scene_parse(scene *s, const char *name, const char *text, const ch
                           const char *const *set, int sets, scene_error *error);
 SCENE_API void scene_free(scene *s);  // a zeroed scene is allowed
 
-// A prepared world. on_iterate may be NULL. *out is NULL on error. The world does not need s to live.
+// A prepared world. host, on_iterate and ipc may be NULL. *out is NULL on error.
 SCENE_API int scene_build(scene *s, const tss_host *host,
                           void (*on_iterate)(const double *, const double *, void *), void *ctx,
                           tss_world **out, tss_ipc **ipc, scene_error *error);
@@ -360,13 +371,14 @@ void scene_pose(const scene_motion *m, double clock, const double *from, double 
     int turns = turn[0] != 0 || turn[1] != 0 || turn[2] != 0;
     for (int c = 0; c < 3; c++)
         out[c] = (turns ? m->pivot[c] + R[3 * c] * d[0] + R[3 * c + 1] * d[1] + R[3 * c + 2] * d[2]
-                        : from[c]) + move[c];
+                        : from[c]) +
+                 move[c];
 }
 
 // ---------------------------------------------------------------------------------------------
 // >>scene_keys (private)
-// A table says what keys an object may have, of what type and in what range, and where they go. What is
-// not in the file keeps the value it had.
+// A table says what keys an object may have, of what type and in what range, and where they go.
+// What is not in the file keeps the value it had.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct scene__reader {
@@ -402,20 +414,25 @@ typedef struct scene__key {
     scene__read_fn *read;
 } scene__key;
 
-#define SCENE__NUM(type_, field, name, lo, hi) {name, SCENE__NUMBER, offsetof(type_, field), lo, hi, NULL, NULL}
-#define SCENE__POS(type_, field, name) {name, SCENE__POSITIVE, offsetof(type_, field), 0, 0, NULL, NULL}
-#define SCENE__INT(type_, field, name, lo, hi) {name, SCENE__COUNT, offsetof(type_, field), lo, hi, NULL, NULL}
+#define SCENE__NUM(type_, field, name, lo, hi)                                                     \
+    {name, SCENE__NUMBER, offsetof(type_, field), lo, hi, NULL, NULL}
+#define SCENE__POS(type_, field, name)                                                             \
+    {name, SCENE__POSITIVE, offsetof(type_, field), 0, 0, NULL, NULL}
+#define SCENE__INT(type_, field, name, lo, hi)                                                     \
+    {name, SCENE__COUNT, offsetof(type_, field), lo, hi, NULL, NULL}
 #define SCENE__OF(kind, type_, field, name) {name, kind, offsetof(type_, field), 0, 0, NULL, NULL}
-#define SCENE__STR(type_, field, name, size) {name, SCENE__TEXT, offsetof(type_, field), 0, size, NULL, NULL}
-#define SCENE__ONE(type_, field, name, words) {name, SCENE__WORD, offsetof(type_, field), 0, 0, words, NULL}
+#define SCENE__STR(type_, field, name, size)                                                       \
+    {name, SCENE__TEXT, offsetof(type_, field), 0, size, NULL, NULL}
+#define SCENE__ONE(type_, field, name, words)                                                      \
+    {name, SCENE__WORD, offsetof(type_, field), 0, 0, words, NULL}
 #define SCENE__FUN(name, fn) {name, SCENE__CALL, 0, 0, 0, NULL, fn}
 #define SCENE__END {NULL, SCENE__NUMBER, 0, 0, 0, NULL, NULL}
 
 static const char *const scene__integrators[] = {"bdf2", "euler", "newmark", "quasistatic", NULL};
 static const char *const scene__linears[] = {"auto", "direct", "pcg", NULL};
 static const char *const scene__fields[] = {"none", "J", "velocity", "strain", NULL};
-static const char *const scene__materials[] = {"neo_hookean", "stable_neo_hookean", "fixed_corotated",
-                                               "stvk", "linear", NULL};
+static const char *const scene__materials[] = {
+    "neo_hookean", "stable_neo_hookean", "fixed_corotated", "stvk", "linear", NULL};
 
 // Letters to change, add or drop to make b of a, at most 99.
 static int scene__distance(const char *a, const char *b) {
@@ -426,7 +443,8 @@ static int scene__distance(const char *a, const char *b) {
         int diagonal = row[0];
         row[0] = i + 1;
         for (int j = 0; j < n; j++) {
-            int keep = diagonal + (a[i] != b[j]), other = 1 + (row[j] < row[j + 1] ? row[j] : row[j + 1]);
+            int keep = diagonal + (a[i] != b[j]),
+                other = 1 + (row[j] < row[j + 1] ? row[j] : row[j + 1]);
             diagonal = row[j + 1];
             row[j + 1] = keep < other ? keep : other;
         }
@@ -456,8 +474,10 @@ static void scene__suggest(const char *word, const char *const *names, char *out
 // Appends ".name" or "[k]" to where; returns what to hand to scene__leave.
 static size_t scene__enter(scene__reader *r, const char *name, int k) {
     size_t n = strlen(r->where);
-    if (name) snprintf(r->where + n, sizeof r->where - n, "%s%s", n ? "." : "", name);
-    else snprintf(r->where + n, sizeof r->where - n, "[%d]", k);
+    if (name)
+        snprintf(r->where + n, sizeof r->where - n, "%s%s", n ? "." : "", name);
+    else
+        snprintf(r->where + n, sizeof r->where - n, "[%d]", k);
     return n;
 }
 
@@ -471,7 +491,9 @@ static int scene__expected(scene__reader *r, const cJSON *v, const char *what) {
     return 0;
 }
 
-static int scene__is_number(const cJSON *v) { return cJSON_IsNumber(v) && isfinite(v->valuedouble); }
+static int scene__is_number(const cJSON *v) {
+    return cJSON_IsNumber(v) && isfinite(v->valuedouble);
+}
 
 static int scene__read_number(scene__reader *r, const cJSON *v, const scene__key *k, double *out) {
     char what[120];
@@ -484,8 +506,10 @@ static int scene__read_number(scene__reader *r, const cJSON *v, const scene__key
         ok = ok && d >= k->lo && d <= k->hi && (k->type != SCENE__COUNT || d == floor(d));
         snprintf(what, sizeof what, "a%s number", k->type == SCENE__COUNT ? " whole" : "");
         size_t n = strlen(what);
-        if (k->hi < 1e300) snprintf(what + n, sizeof what - n, " from %g to %g", k->lo, k->hi);
-        else if (k->lo > -1e300) snprintf(what + n, sizeof what - n, " >= %g", k->lo);
+        if (k->hi < 1e300)
+            snprintf(what + n, sizeof what - n, " from %g to %g", k->lo, k->hi);
+        else if (k->lo > -1e300)
+            snprintf(what + n, sizeof what - n, " >= %g", k->lo);
     }
     *out = d;
     return ok ? 1 : scene__expected(r, v, what);
@@ -501,8 +525,10 @@ static int scene__read_numbers(scene__reader *r, const cJSON *v, int least, int 
         out[i] = e->valuedouble;
     }
     if (ok) return n;
-    if (least == most) snprintf(what, sizeof what, "%d numbers in [ ]", least);
-    else snprintf(what, sizeof what, "%d to %d numbers in [ ]", least, most);
+    if (least == most)
+        snprintf(what, sizeof what, "%d numbers in [ ]", least);
+    else
+        snprintf(what, sizeof what, "%d to %d numbers in [ ]", least, most);
     return scene__expected(r, v, what);
 }
 
@@ -512,7 +538,8 @@ static int scene__read_word(scene__reader *r, const cJSON *v, const char *const 
         if (strcmp(words[k], v->valuestring) == 0) return *out = k, 1;
     if (!cJSON_IsString(v)) return scene__expected(r, v, "a word in \" \"");
     scene__suggest(v->valuestring, words, hint, sizeof hint);
-    return scene__fail(r->error, "%s: %s is \"%.60s\": %s", r->s->file, r->where, v->valuestring, hint);
+    return scene__fail(r->error, "%s: %s is \"%.60s\": %s", r->s->file, r->where, v->valuestring,
+                       hint);
 }
 
 static int scene__read_text(scene__reader *r, const cJSON *v, const scene__key *k, char *out) {
@@ -533,7 +560,8 @@ static int scene__read_group(scene__reader *r, const cJSON *v, const scene__key 
         for (int c = 0; c < got; c++) out[c] = unit * n[c];
         return got > 0;
     }
-    if (!scene__read_numbers(r, v, k->type == SCENE__COLOR ? 3 : 2, k->type == SCENE__COLOR ? 3 : 2, n))
+    if (!scene__read_numbers(r, v, k->type == SCENE__COLOR ? 3 : 2, k->type == SCENE__COLOR ? 3 : 2,
+                             n))
         return 0;
     if (k->type == SCENE__PAIR) memcpy(to, n, 2 * sizeof *n);
     for (int c = 0; k->type == SCENE__COLOR && c < 3; c++) {
@@ -553,17 +581,22 @@ static int scene__read_value(scene__reader *r, const cJSON *v, const scene__key 
     double d = 0;
     switch (k->type) {
         case SCENE__NUMBER:
-        case SCENE__POSITIVE: return scene__read_number(r, v, k, (double *)(void *)to);
+        case SCENE__POSITIVE:
+            return scene__read_number(r, v, k, (double *)(void *)to);
         case SCENE__COUNT:
             if (!scene__read_number(r, v, k, &d)) return 0;
             return *(int *)(void *)to = (int)d, 1;
         case SCENE__FLAG:
             if (!cJSON_IsBool(v)) return scene__expected(r, v, "true or false");
             return *(int *)(void *)to = cJSON_IsTrue(v) ? 1 : 0, 1;
-        case SCENE__TEXT: return scene__read_text(r, v, k, to);
-        case SCENE__WORD: return scene__read_word(r, v, k->words, (int *)(void *)to);
-        case SCENE__CALL: return k->read(r, v, base);
-        default: return scene__read_group(r, v, k, to);
+        case SCENE__TEXT:
+            return scene__read_text(r, v, k, to);
+        case SCENE__WORD:
+            return scene__read_word(r, v, k->words, (int *)(void *)to);
+        case SCENE__CALL:
+            return k->read(r, v, base);
+        default:
+            return scene__read_group(r, v, k, to);
     }
 }
 
@@ -578,7 +611,8 @@ static int scene__unknown(scene__reader *r, const char *key, const scene__key *k
                        r->where[0] ? "." : "", key, hint);
 }
 
-static int scene__read_object(scene__reader *r, const cJSON *object, const scene__key *keys, void *base) {
+static int scene__read_object(scene__reader *r, const cJSON *object, const scene__key *keys,
+                              void *base) {
     if (!cJSON_IsObject(object)) return scene__expected(r, object, "keys in { }");
     for (const cJSON *v = object->child; v; v = v->next) {
         const scene__key *k = keys;
@@ -595,7 +629,8 @@ static int scene__read_object(scene__reader *r, const cJSON *object, const scene
 }
 
 // Calls read for each element of an array.
-static int scene__read_array(scene__reader *r, const cJSON *array, scene__read_fn *read, void *base) {
+static int scene__read_array(scene__reader *r, const cJSON *array, scene__read_fn *read,
+                             void *base) {
     int i = 0;
     if (!cJSON_IsArray(array)) return scene__expected(r, array, "a list in [ ]");
     for (const cJSON *v = array->child; v; v = v->next) {
@@ -625,9 +660,18 @@ static double scene__height(double x, double z, void *ctx) {
     return h->height * tss_shape_hills(x / h->wave, z / h->wave, NULL);
 }
 
-// Generated shapes that are not solids by name, and the keys each takes (bits as in the table below).
-enum { SCENE__CELLS = 1, SCENE__LOWER = 2, SCENE__UPPER = 4, SCENE__N = 8, SCENE__RATIO = 16,
-       SCENE__RADIUS = 32, SCENE__HEIGHT = 64, SCENE__WAVE = 128, SCENE__SPLIT = 256 };
+// Generated shapes that are not solids by name, and the keys each takes (bits).
+enum {
+    SCENE__CELLS = 1,
+    SCENE__LOWER = 2,
+    SCENE__UPPER = 4,
+    SCENE__N = 8,
+    SCENE__RATIO = 16,
+    SCENE__RADIUS = 32,
+    SCENE__HEIGHT = 64,
+    SCENE__WAVE = 128,
+    SCENE__SPLIT = 256
+};
 #define SCENE__BOX (SCENE__LOWER | SCENE__UPPER | SCENE__CELLS)
 #define SCENE__SHAPES(X)                                                                          \
     X(BOX, "box", SCENE__BOX | SCENE__SPLIT)                                                      \
@@ -655,9 +699,9 @@ static const char *const scene__shape_names[] = {
     TSS_SHAPES(SCENE__NAME)
 #undef SCENE__NAME
 #define SCENE__NAME(id, name, keys) name,
-    SCENE__SHAPES(SCENE__NAME)
+        SCENE__SHAPES(SCENE__NAME)
 #undef SCENE__NAME
-    NULL};
+            NULL};
 
 static const unsigned scene__shape_uses[] = {
 #define SCENE__NAME(id, name, keys) keys,
@@ -669,8 +713,10 @@ static int scene__read_cells(scene__reader *r, const cJSON *v, void *base) {
     scene__shape *d = (scene__shape *)base;
     double n[3];
     int got = 1;
-    if (scene__is_number(v)) n[0] = v->valuedouble;
-    else got = scene__read_numbers(r, v, 1, 3, n);
+    if (scene__is_number(v))
+        n[0] = v->valuedouble;
+    else
+        got = scene__read_numbers(r, v, 1, 3, n);
     for (int c = 0; got && c < 3; c++) {
         double k = n[c < got ? c : got - 1];
         if (!(k >= 1 && k <= 1000 && k == floor(k)))
@@ -681,12 +727,17 @@ static int scene__read_cells(scene__reader *r, const cJSON *v, void *base) {
 }
 
 static const scene__key scene__shape_keys[] = {
-    SCENE__FUN("cells", scene__read_cells), SCENE__OF(SCENE__VECTOR, scene__shape, lower, "lower"),
-    SCENE__OF(SCENE__VECTOR, scene__shape, upper, "upper"), SCENE__INT(scene__shape, count, "count", 1, 10000),
-    SCENE__NUM(scene__shape, ratio, "ratio", 0, 0.5), SCENE__POS(scene__shape, radius, "radius"),
-    SCENE__NUM(scene__shape, height, "height", 0, 1e9), SCENE__POS(scene__shape, wave, "wave"),
+    SCENE__FUN("cells", scene__read_cells),
+    SCENE__OF(SCENE__VECTOR, scene__shape, lower, "lower"),
+    SCENE__OF(SCENE__VECTOR, scene__shape, upper, "upper"),
+    SCENE__INT(scene__shape, count, "count", 1, 10000),
+    SCENE__NUM(scene__shape, ratio, "ratio", 0, 0.5),
+    SCENE__POS(scene__shape, radius, "radius"),
+    SCENE__NUM(scene__shape, height, "height", 0, 1e9),
+    SCENE__POS(scene__shape, wave, "wave"),
     SCENE__INT(scene__shape, split, "split", 5, 6),
-    SCENE__ONE(scene__shape, kind, "kind", scene__shape_names), SCENE__END};
+    SCENE__ONE(scene__shape, kind, "kind", scene__shape_names),
+    SCENE__END};
 
 static int scene__read_shape(scene__reader *r, const cJSON *v, scene__shape *d) {
     memset(d, 0, sizeof *d);
@@ -698,8 +749,8 @@ static int scene__read_shape(scene__reader *r, const cJSON *v, scene__shape *d) 
                                               : scene__shape_uses[d->kind - TSS_SHAPE_COUNT];
     for (int k = 0; k < 9; k++)
         if (!(uses >> k & 1) && cJSON_GetObjectItemCaseSensitive(v, scene__shape_keys[k].name))
-            return scene__fail(r->error, "%s: %s.%s has no meaning for a \"%s\"", r->s->file, r->where,
-                               scene__shape_keys[k].name, scene__shape_names[d->kind]);
+            return scene__fail(r->error, "%s: %s.%s has no meaning for a \"%s\"", r->s->file,
+                               r->where, scene__shape_keys[k].name, scene__shape_names[d->kind]);
     for (int c = 0; c < 3 && d->cells[c] == 0; c++)
         if (d->kind >= TSS_SHAPE_COUNT) d->cells[c] = 8;
     return 1;
@@ -718,19 +769,32 @@ static tss_result scene__make_shape(const scene__shape *d, tss_mesh *out) {
     const int *n = d->cells, count = d->count > 0 ? d->count : 8;
     scene__hills hills = {d->height, d->wave};
     switch (d->kind) {
-        case SCENE__SHAPE_BOX: return tss_shape_box(NULL, lo, hi, n, d->split, NULL, out);
-        case SCENE__SHAPE_TERRAIN: return tss_shape_terrain_block(NULL, lo, hi, n, scene__height, &hills, out);
-        case SCENE__SHAPE_SHEET: return tss_shape_grid(NULL, lo2, hi2, n[0], n[2], NULL, NULL, out);
-        case SCENE__SHAPE_HILLS: return tss_shape_grid(NULL, lo2, hi2, n[0], n[2], scene__height, &hills, out);
-        case SCENE__SHAPE_SPIKE_SHEET: return tss_shape_spike_sheet(NULL, lo2, hi2, n[0], n[2], d->height, out);
-        case SCENE__SHAPE_BALL_SURFACE: return tss_shape_ball_surface(NULL, d->radius, count, out);
-        case SCENE__SHAPE_BOX_SURFACE: return tss_shape_box_surface(NULL, lo, hi, n, out);
-        case SCENE__SHAPE_CONE_SURFACE: return tss_shape_cone_surface(NULL, d->radius, d->height, count, out);
-        case SCENE__SHAPE_SEGMENTS: return tss_shape_segments(NULL, lo, hi, count, n[0], out);
-        case SCENE__SHAPE_POINTS: return tss_shape_points(NULL, lo, hi, n, out);
-        case SCENE__SHAPE_RECTANGLE: return tss_shape_rectangle(NULL, lo, hi, n[0], n[1], out);
-        case SCENE__SHAPE_DISC: return tss_shape_disc(NULL, d->radius, count, out);
-        default: return scene__make_solid(d, out);
+        case SCENE__SHAPE_BOX:
+            return tss_shape_box(NULL, lo, hi, n, d->split, NULL, out);
+        case SCENE__SHAPE_TERRAIN:
+            return tss_shape_terrain_block(NULL, lo, hi, n, scene__height, &hills, out);
+        case SCENE__SHAPE_SHEET:
+            return tss_shape_grid(NULL, lo2, hi2, n[0], n[2], NULL, NULL, out);
+        case SCENE__SHAPE_HILLS:
+            return tss_shape_grid(NULL, lo2, hi2, n[0], n[2], scene__height, &hills, out);
+        case SCENE__SHAPE_SPIKE_SHEET:
+            return tss_shape_spike_sheet(NULL, lo2, hi2, n[0], n[2], d->height, out);
+        case SCENE__SHAPE_BALL_SURFACE:
+            return tss_shape_ball_surface(NULL, d->radius, count, out);
+        case SCENE__SHAPE_BOX_SURFACE:
+            return tss_shape_box_surface(NULL, lo, hi, n, out);
+        case SCENE__SHAPE_CONE_SURFACE:
+            return tss_shape_cone_surface(NULL, d->radius, d->height, count, out);
+        case SCENE__SHAPE_SEGMENTS:
+            return tss_shape_segments(NULL, lo, hi, count, n[0], out);
+        case SCENE__SHAPE_POINTS:
+            return tss_shape_points(NULL, lo, hi, n, out);
+        case SCENE__SHAPE_RECTANGLE:
+            return tss_shape_rectangle(NULL, lo, hi, n[0], n[1], out);
+        case SCENE__SHAPE_DISC:
+            return tss_shape_disc(NULL, d->radius, count, out);
+        default:
+            return scene__make_solid(d, out);
     }
 }
 
@@ -746,7 +810,8 @@ static void scene__find(const scene__reader *r, const char *name, char *path, si
     int dir = slash ? (int)(slash - r->s->file) : 1;
     const char *file = slash ? r->s->file : ".";
     if (name[0] != '/') {
-        if (r->assets && (snprintf(path, size, "%s/%s", r->assets, name), scene__exists(path))) return;
+        if (r->assets && (snprintf(path, size, "%s/%s", r->assets, name), scene__exists(path)))
+            return;
         if (snprintf(path, size, "%.*s/%s", dir, file, name), scene__exists(path)) return;
         if (snprintf(path, size, "%.*s/../%s", dir, file, name), scene__exists(path)) return;
     }
@@ -759,7 +824,8 @@ static int scene__load(scene__reader *r, const char *name, tss_mesh *out) {
     scene__find(r, name, path, sizeof path);
     if (tss_mesh_read(NULL, path, out, &why) == TSS_OK) return 1;
     if (why.line > 0)
-        return scene__fail(r->error, "%s: %s: %s:%lld: %s", r->s->file, r->where, why.file, why.line, why.message);
+        return scene__fail(r->error, "%s: %s: %s:%lld: %s", r->s->file, r->where, why.file,
+                           why.line, why.message);
     return scene__fail(r->error, "%s: %s: %s: %s%s", r->s->file, r->where, name, why.message,
                        r->assets ? "" : " (--assets DIR says where meshes are)");
 }
@@ -834,7 +900,8 @@ static int *scene__select(const tss_mesh *m, const scene__region *where, int *co
         int in = on[i];
         for (int c = 0; c < 3 && in; c++) {
             // Slack: 1 must select the last layer whatever the rounding of lo + 1·(hi − lo).
-            double size = hi[c] - lo[c], slack = where->metres ? 0 : 1e-9 * size, x = m->x[3 * i + c];
+            double size = hi[c] - lo[c], slack = where->metres ? 0 : 1e-9 * size,
+                   x = m->x[3 * i + c];
             double a = where->metres ? where->lower[c] : lo[c] + where->lower[c] * size;
             double b = where->metres ? where->upper[c] : lo[c] + where->upper[c] * size;
             in = x >= a - slack && x <= b + slack;
@@ -845,50 +912,61 @@ static int *scene__select(const tss_mesh *m, const scene__region *where, int *co
     return node;
 }
 
-
 // ---------------------------------------------------------------------------------------------
 // >>scene_json (private)
 // ---------------------------------------------------------------------------------------------
 
 static const scene__key scene__world_keys[] = {
-    SCENE__INT(scene, world.dim, "dim", 2, 3), SCENE__POS(scene, world.dt, "dt"),
-    SCENE__INT(scene, world.steps, "steps", 0, 1e9), SCENE__OF(SCENE__VECTOR, scene, world.gravity, "gravity"),
-    SCENE__ONE(scene, world.integrator, "integrator", scene__integrators), SCENE__END};
+    SCENE__INT(scene, world.dim, "dim", 2, 3),
+    SCENE__POS(scene, world.dt, "dt"),
+    SCENE__INT(scene, world.steps, "steps", 0, 1e9),
+    SCENE__OF(SCENE__VECTOR, scene, world.gravity, "gravity"),
+    SCENE__ONE(scene, world.integrator, "integrator", scene__integrators),
+    SCENE__END};
 
 static const scene__key scene__solver_keys[] = {
-    SCENE__NUM(scene, solver.tol, "tol", 0, 1e300), SCENE__POS(scene, solver.tol_rel, "tol_rel"),
+    SCENE__NUM(scene, solver.tol, "tol", 0, 1e300),
+    SCENE__POS(scene, solver.tol_rel, "tol_rel"),
     SCENE__INT(scene, solver.max_iterations, "max_iterations", 1, 1e9),
     SCENE__ONE(scene, solver.linear, "linear", scene__linears),
     SCENE__POS(scene, solver.pcg_tol, "pcg_tol"),
-    SCENE__INT(scene, solver.pcg_iterations, "pcg_iterations", 1, 1e9), SCENE__END};
+    SCENE__INT(scene, solver.pcg_iterations, "pcg_iterations", 1, 1e9),
+    SCENE__END};
 
 static const scene__key scene__contact_keys[] = {
     SCENE__OF(SCENE__FLAG, scene, contact.enabled, "enabled"),
-    SCENE__NUM(scene, contact.dhat, "dhat", 0, 1e300), SCENE__POS(scene, contact.dhat_rel, "dhat_rel"),
+    SCENE__NUM(scene, contact.dhat, "dhat", 0, 1e300),
+    SCENE__POS(scene, contact.dhat_rel, "dhat_rel"),
     SCENE__NUM(scene, contact.dhat_edge, "dhat_edge", 0, 1e300),
-    SCENE__NUM(scene, contact.mu, "mu", 0, 1e6), SCENE__NUM(scene, contact.eps_v, "eps_v", 0, 1e300),
+    SCENE__NUM(scene, contact.mu, "mu", 0, 1e6),
+    SCENE__NUM(scene, contact.eps_v, "eps_v", 0, 1e300),
     SCENE__POS(scene, contact.eps_v_rel, "eps_v_rel"),
     SCENE__NUM(scene, contact.kappa, "kappa", 0, 1e300),
     SCENE__INT(scene, contact.friction_iterations, "friction_iterations", 1, 1e6),
-    SCENE__OF(SCENE__FLAG, scene, contact.self, "self"), SCENE__END};
+    SCENE__OF(SCENE__FLAG, scene, contact.self, "self"),
+    SCENE__END};
 
 static const scene__key scene__frames_keys[] = {
     {"size", SCENE__SIZE, offsetof(scene, frames.width), 16, 8192, NULL, NULL},
     SCENE__ONE(scene, frames.field, "field", scene__fields),
     SCENE__OF(SCENE__PAIR, scene, frames.range, "range"),
-    SCENE__NUM(scene, frames.wireframe, "wireframe", 0, 1), SCENE__END};
+    SCENE__NUM(scene, frames.wireframe, "wireframe", 0, 1),
+    SCENE__END};
 
 static const scene__key scene__run_keys[] = {
-    SCENE__OF(SCENE__FLAG, scene, run.check, "check"), SCENE__INT(scene, run.every, "every", 1, 1e9),
+    SCENE__OF(SCENE__FLAG, scene, run.check, "check"),
+    SCENE__INT(scene, run.every, "every", 1, 1e9),
     SCENE__NUM(scene, run.budget_ms, "budget_ms", 0, 1e12),
     SCENE__STR(scene, run.frames, "frames", sizeof(((scene *)0)->run.frames)), SCENE__END};
 
 static const scene__key scene__camera_keys[] = {
     SCENE__NUM(scene, camera.azimuth, "azimuth", -1e6, 1e6),
     SCENE__NUM(scene, camera.elevation, "elevation", -90, 90),
-    SCENE__NUM(scene, camera.fov, "fov", 0, 150), SCENE__POS(scene, camera.zoom, "zoom"),
+    SCENE__NUM(scene, camera.fov, "fov", 0, 150),
+    SCENE__POS(scene, camera.zoom, "zoom"),
     SCENE__NUM(scene, camera.distance, "distance", 0, 1e300),
-    SCENE__OF(SCENE__VECTOR, scene, camera.target, "target"), SCENE__END};
+    SCENE__OF(SCENE__VECTOR, scene, camera.target, "target"),
+    SCENE__END};
 
 static const scene__key scene__keyframe_keys[] = {
     SCENE__NUM(scene_keyframe, time, "time", 0, 1e300),
@@ -903,8 +981,8 @@ static int scene__read_keyframe(scene__reader *r, const cJSON *v, void *base) {
     scene_keyframe *k = &m->keyframe[m->keyframes++];
     if (!scene__read_object(r, v, scene__keyframe_keys, k)) return 0;
     if (m->keyframes > 1 && !(k->time > k[-1].time))
-        return scene__fail(r->error, "%s: %s.time is %g, expected more than the %g before it", r->s->file,
-                           r->where, k->time, k[-1].time);
+        return scene__fail(r->error, "%s: %s.time is %g, expected more than the %g before it",
+                           r->s->file, r->where, k->time, k[-1].time);
     return 1;
 }
 
@@ -915,8 +993,11 @@ static int scene__read_keyframes(scene__reader *r, const cJSON *v, void *base) {
 static const scene__key scene__motion_keys[] = {
     SCENE__OF(SCENE__VECTOR, scene_motion, velocity, "velocity"),
     SCENE__OF(SCENE__DEGREES, scene_motion, angular, "angular_velocity"),
-    SCENE__OF(SCENE__VECTOR, scene_motion, pivot, "pivot"), SCENE__NUM(scene_motion, start, "start", 0, 1e300),
-    SCENE__NUM(scene_motion, end, "end", 0, 1e300), SCENE__FUN("keyframes", scene__read_keyframes), SCENE__END};
+    SCENE__OF(SCENE__VECTOR, scene_motion, pivot, "pivot"),
+    SCENE__NUM(scene_motion, start, "start", 0, 1e300),
+    SCENE__NUM(scene_motion, end, "end", 0, 1e300),
+    SCENE__FUN("keyframes", scene__read_keyframes),
+    SCENE__END};
 
 static int scene__read_motion(scene__reader *r, const cJSON *v, scene_motion *m) {
     m->moves = 1, m->end = INFINITY;
@@ -926,8 +1007,8 @@ static int scene__read_motion(scene__reader *r, const cJSON *v, scene_motion *m)
         for (int k = 0; k < 2 + 2; k++) {
             static const char *const plain[] = {"velocity", "angular_velocity", "start", "end"};
             if (cJSON_GetObjectItemCaseSensitive(v, plain[k]))
-                return scene__fail(r->error, "%s: %s.%s: keyframes already say how it moves", r->s->file,
-                                   r->where, plain[k]);
+                return scene__fail(r->error, "%s: %s.%s: keyframes already say how it moves",
+                                   r->s->file, r->where, plain[k]);
         }
     return 1;
 }
@@ -966,12 +1047,16 @@ static int scene__read_scale(scene__reader *r, const cJSON *v, void *base) {
 }
 
 static const scene__key scene__material_keys[] = {
-    SCENE__ONE(scene_body, material.kind, "kind", scene__materials), SCENE__POS(scene_body, material.E, "E"),
-    SCENE__NUM(scene_body, material.nu, "nu", -0.999, 0.4999), SCENE__POS(scene_body, material.rho, "rho"),
-    SCENE__NUM(scene_body, material.damping, "damping", 0, 1e300), SCENE__END};
+    SCENE__ONE(scene_body, material.kind, "kind", scene__materials),
+    SCENE__POS(scene_body, material.E, "E"),
+    SCENE__NUM(scene_body, material.nu, "nu", -0.999, 0.4999),
+    SCENE__POS(scene_body, material.rho, "rho"),
+    SCENE__NUM(scene_body, material.damping, "damping", 0, 1e300),
+    SCENE__END};
 
 static int scene__read_material(scene__reader *r, const cJSON *v, void *base) {
-    return scene__read_object(r, v, scene__material_keys, base);  // b is the first member of a raw body
+    return scene__read_object(r, v, scene__material_keys,
+                              base);  // b is the first member of a raw body
 }
 
 static int scene__read_body_motion(scene__reader *r, const cJSON *v, void *base) {
@@ -991,38 +1076,48 @@ static int scene__keep_forces(scene__reader *r, const cJSON *v, void *base) {
 static const scene__key scene__body_keys[] = {
     SCENE__STR(scene__raw, b.name, "name", sizeof(((scene_body *)0)->name)),
     SCENE__STR(scene__raw, mesh, "mesh", sizeof(((scene__raw *)0)->mesh)),
-    SCENE__FUN("shape", scene__read_raw_shape), SCENE__FUN("scale", scene__read_scale),
+    SCENE__FUN("shape", scene__read_raw_shape),
+    SCENE__FUN("scale", scene__read_scale),
     SCENE__OF(SCENE__VECTOR, scene__raw, rotate, "rotate"),
     SCENE__OF(SCENE__VECTOR, scene__raw, translate, "translate"),
-    SCENE__FUN("material", scene__read_material), SCENE__OF(SCENE__VECTOR, scene__raw, b.velocity, "velocity"),
+    SCENE__FUN("material", scene__read_material),
+    SCENE__OF(SCENE__VECTOR, scene__raw, b.velocity, "velocity"),
     SCENE__OF(SCENE__DEGREES, scene__raw, b.angular, "angular_velocity"),
-    SCENE__FUN("pins", scene__keep_pins), SCENE__FUN("forces", scene__keep_forces),
+    SCENE__FUN("pins", scene__keep_pins),
+    SCENE__FUN("forces", scene__keep_forces),
     SCENE__OF(SCENE__FLAG, scene__raw, b.obstacle, "obstacle"),
-    SCENE__FUN("motion", scene__read_body_motion), SCENE__NUM(scene__raw, b.mu, "mu", 0, 1e6),
-    SCENE__OF(SCENE__COLOR, scene__raw, b.color, "color"), SCENE__END};
+    SCENE__FUN("motion", scene__read_body_motion),
+    SCENE__NUM(scene__raw, b.mu, "mu", 0, 1e6),
+    SCENE__OF(SCENE__COLOR, scene__raw, b.color, "color"),
+    SCENE__END};
 
 // What may be set on a body that a script has placed.
 static const scene__key scene__late_keys[] = {
-    SCENE__FUN("material", scene__read_material), SCENE__OF(SCENE__VECTOR, scene_body, velocity, "velocity"),
+    SCENE__FUN("material", scene__read_material),
+    SCENE__OF(SCENE__VECTOR, scene_body, velocity, "velocity"),
     SCENE__OF(SCENE__DEGREES, scene_body, angular, "angular_velocity"),
-    SCENE__NUM(scene_body, mu, "mu", 0, 1e6), SCENE__OF(SCENE__COLOR, scene_body, color, "color"), SCENE__END};
+    SCENE__NUM(scene_body, mu, "mu", 0, 1e6),
+    SCENE__OF(SCENE__COLOR, scene_body, color, "color"),
+    SCENE__END};
 
 static int scene__read_item_motion(scene__reader *r, const cJSON *v, void *base) {
     return scene__read_motion(r, v, &((scene__box_item *)base)->motion);
 }
 
-#define SCENE__WHERE                                                                              \
-    SCENE__OF(SCENE__VECTOR, scene__box_item, where.lower, "lower"),                              \
-        SCENE__OF(SCENE__VECTOR, scene__box_item, where.upper, "upper"),                          \
+#define SCENE__WHERE                                                     \
+    SCENE__OF(SCENE__VECTOR, scene__box_item, where.lower, "lower"),     \
+        SCENE__OF(SCENE__VECTOR, scene__box_item, where.upper, "upper"), \
         SCENE__OF(SCENE__FLAG, scene__box_item, where.metres, "metres")
 static const scene__key scene__pin_keys[] = {
     SCENE__WHERE, SCENE__STR(scene__box_item, axes, "axes", 8),
-    SCENE__OF(SCENE__FLAG, scene__box_item, release, "release"), SCENE__FUN("motion", scene__read_item_motion),
-    SCENE__END};
+    SCENE__OF(SCENE__FLAG, scene__box_item, release, "release"),
+    SCENE__FUN("motion", scene__read_item_motion), SCENE__END};
 static const scene__key scene__force_keys[] = {
-    SCENE__WHERE, SCENE__OF(SCENE__VECTOR, scene__box_item, force, "force"),
+    SCENE__WHERE,
+    SCENE__OF(SCENE__VECTOR, scene__box_item, force, "force"),
     SCENE__OF(SCENE__VECTOR, scene__box_item, acceleration, "acceleration"),
-    SCENE__NUM(scene__box_item, start, "start", 0, 1e300), SCENE__NUM(scene__box_item, end, "end", 0, 1e300),
+    SCENE__NUM(scene__box_item, start, "start", 0, 1e300),
+    SCENE__NUM(scene__box_item, end, "end", 0, 1e300),
     SCENE__END};
 
 static scene__box_item scene__item(void) {
@@ -1035,12 +1130,14 @@ static scene__box_item scene__item(void) {
 }
 
 static int scene__nobody(scene__reader *r, const scene_body *b) {
-    return scene__fail(r->error, "%s: %s: no node of %s is in this box (lower and upper are 0..1 of the "
-                       "body's box unless metres is true)", r->s->file, r->where, b->name);
+    return scene__fail(r->error,
+                       "%s: %s: no node of %s is in this box (lower and upper are 0..1 of the "
+                       "body's box unless metres is true)",
+                       r->s->file, r->where, b->name);
 }
 
-static int scene__add_pin(scene_body *b, const scene__box_item *it, int *node, int nodes, unsigned axes,
-                          scene_error *e) {
+static int scene__add_pin(scene_body *b, const scene__box_item *it, int *node, int nodes,
+                          unsigned axes, scene_error *e) {
     void *p = scene__grow(b->pin, b->pins, sizeof *b->pin, e);
     if (!p) {
         free(node);
@@ -1048,11 +1145,13 @@ static int scene__add_pin(scene_body *b, const scene__box_item *it, int *node, i
     }
     b->pin = (scene_pin *)p;
     scene_pin *to = &b->pin[b->pins++];
-    to->node = node, to->nodes = nodes, to->axes = axes, to->release = it->release, to->motion = it->motion;
+    to->node = node, to->nodes = nodes, to->axes = axes, to->release = it->release,
+    to->motion = it->motion;
     return 1;
 }
 
-static int scene__add_force(scene_body *b, const scene__box_item *it, int *node, int nodes, scene_error *e) {
+static int scene__add_force(scene_body *b, const scene__box_item *it, int *node, int nodes,
+                            scene_error *e) {
     void *p = scene__grow(b->force, b->forces, sizeof *b->force, e);
     if (!p) {
         free(node);
@@ -1074,8 +1173,10 @@ static int scene__read_pin(scene__reader *r, const cJSON *v, void *base) {
     int ok = scene__read_object(r, v, scene__pin_keys, &it);
     for (const char *c = it.axes; ok && *c; c++)
         if (*c < 'x' || *c > 'z')
-            ok = scene__fail(r->error, "%s: %s.axes is \"%s\", expected some of xyz", r->s->file, r->where, it.axes);
-        else axes |= 1u << (*c - 'x');
+            ok = scene__fail(r->error, "%s: %s.axes is \"%s\", expected some of xyz", r->s->file,
+                             r->where, it.axes);
+        else
+            axes |= 1u << (*c - 'x');
     node = ok ? scene__select(&b->mesh, &it.where, &nodes) : NULL;
     if (ok && node && nodes > 0) return scene__add_pin(b, &it, node, nodes, axes, r->error);
     free(it.motion.keyframe);
@@ -1099,9 +1200,11 @@ static int scene__body_mesh(scene__reader *r, scene__raw *w) {
     tss_mesh *m = &w->b.mesh, surface;
     double R[9] = {w->scale[0], 0, 0, 0, w->scale[1], 0, 0, 0, w->scale[2]}, zero[3] = {0, 0, 0};
     if (w->mesh[0] && w->has_shape)
-        return scene__fail(r->error, "%s: %s has a mesh and a shape, expected one of them", r->s->file, r->where);
+        return scene__fail(r->error, "%s: %s has a mesh and a shape, expected one of them",
+                           r->s->file, r->where);
     if (!w->mesh[0] && !w->has_shape)
-        return scene__fail(r->error, "%s: %s has no mesh, expected \"mesh\" or \"shape\"", r->s->file, r->where);
+        return scene__fail(r->error, "%s: %s has no mesh, expected \"mesh\" or \"shape\"",
+                           r->s->file, r->where);
     if (w->mesh[0]) {
         if (!scene__load(r, w->mesh, m)) return 0;
     } else {
@@ -1120,7 +1223,8 @@ static int scene__body_mesh(scene__reader *r, scene__raw *w) {
     }
     if (w->b.obstacle && r->s->world.dim == 2 && m->triangles > 0 && !scene__outline(m))
         return scene__fail(r->error, "out of memory");
-    return tss_mesh_drop_unreferenced(m, NULL) == TSS_OK ? 1 : scene__fail(r->error, "out of memory");
+    return tss_mesh_drop_unreferenced(m, NULL) == TSS_OK ? 1
+                                                         : scene__fail(r->error, "out of memory");
 }
 
 static int scene__body_check(scene__reader *r, const scene_body *b) {
@@ -1129,13 +1233,15 @@ static int scene__body_check(scene__reader *r, const scene_body *b) {
     if (r->s->world.dim == 2 && m->dim == 3)
         for (int i = 0; i < m->nodes; i++)
             if (m->x[3 * i + 2] != 0)
-                return scene__fail(r->error, "%s: %s: node %d has z = %g, expected 0 in 2D", r->s->file, r->where,
-                                   i, m->x[3 * i + 2]);
+                return scene__fail(r->error, "%s: %s: node %d has z = %g, expected 0 in 2D",
+                                   r->s->file, r->where, i, m->x[3 * i + 2]);
     if (!b->obstacle && cells == 0)
-        return scene__fail(r->error, "%s: %s: %s has no %s; surfaces and segments need \"obstacle\": true",
-                           r->s->file, r->where, b->name, r->s->world.dim == 3 ? "tets" : "triangles");
+        return scene__fail(
+            r->error, "%s: %s: %s has no %s; surfaces and segments need \"obstacle\": true",
+            r->s->file, r->where, b->name, r->s->world.dim == 3 ? "tets" : "triangles");
     if (b->obstacle && (b->pins || b->forces))
-        return scene__fail(r->error, "%s: %s: an obstacle has a motion, not pins or forces", r->s->file, r->where);
+        return scene__fail(r->error, "%s: %s: an obstacle has a motion, not pins or forces",
+                           r->s->file, r->where);
     return 1;
 }
 
@@ -1188,7 +1294,8 @@ static int scene__read_body(scene__reader *r, const cJSON *v, void *base) {
 }
 
 static const scene__key scene__plane_keys[] = {
-    SCENE__OF(SCENE__VECTOR, scene_plane, origin, "origin"), SCENE__OF(SCENE__VECTOR, scene_plane, normal, "normal"),
+    SCENE__OF(SCENE__VECTOR, scene_plane, origin, "origin"),
+    SCENE__OF(SCENE__VECTOR, scene_plane, normal, "normal"),
     SCENE__NUM(scene_plane, mu, "mu", 0, 1e6), SCENE__END};
 
 static scene_plane *scene__add_plane(scene *s, scene_error *e) {
@@ -1210,8 +1317,10 @@ static int scene__unit(double *n) {
 static int scene__read_plane(scene__reader *r, const cJSON *v, void *base) {
     scene_plane *p = scene__add_plane((scene *)base, r->error);
     if (!p || !scene__read_object(r, v, scene__plane_keys, p)) return 0;
-    return scene__unit(p->normal) ? 1 : scene__fail(r->error, "%s: %s.normal is 0, expected a direction",
-                                                    r->s->file, r->where);
+    return scene__unit(p->normal)
+               ? 1
+               : scene__fail(r->error, "%s: %s.normal is 0, expected a direction", r->s->file,
+                             r->where);
 }
 
 static int scene__read_world(scene__reader *r, const cJSON *v, void *base) {
@@ -1241,13 +1350,14 @@ static int scene__read_planes(scene__reader *r, const cJSON *v, void *base) {
 // A script's bodies are there already: {"0": {...}} from --set bodies.0.material.E=...
 static int scene__read_bodies(scene__reader *r, const cJSON *v, void *base) {
     scene *s = (scene *)base;
-    if (!cJSON_IsObject(v) || s->bodies == 0) return scene__read_array(r, v, scene__read_body, base);
+    if (!cJSON_IsObject(v) || s->bodies == 0)
+        return scene__read_array(r, v, scene__read_body, base);
     for (const cJSON *b = v->child; b; b = b->next) {
         char *end;
         long k = strtol(b->string, &end, 10);
         if (*end || k < 0 || k >= s->bodies)
-            return scene__fail(r->error, "%s: bodies.%s: no such body, expected 0 to %d", s->file, b->string,
-                               s->bodies - 1);
+            return scene__fail(r->error, "%s: bodies.%s: no such body, expected 0 to %d", s->file,
+                               b->string, s->bodies - 1);
         size_t n = scene__enter(r, NULL, (int)k);
         if (!scene__read_object(r, b, scene__late_keys, &s->body[k])) return 0;
         scene__leave(r, n);
@@ -1255,11 +1365,15 @@ static int scene__read_bodies(scene__reader *r, const cJSON *v, void *base) {
     return 1;
 }
 
-static const scene__key scene__root_keys[] = {
-    SCENE__FUN("world", scene__read_world), SCENE__FUN("solver", scene__read_solver),
-    SCENE__FUN("contact", scene__read_contact), SCENE__FUN("bodies", scene__read_bodies),
-    SCENE__FUN("planes", scene__read_planes), SCENE__FUN("camera", scene__read_camera),
-    SCENE__FUN("frames", scene__read_frames), SCENE__FUN("run", scene__read_run), SCENE__END};
+static const scene__key scene__root_keys[] = {SCENE__FUN("world", scene__read_world),
+                                              SCENE__FUN("solver", scene__read_solver),
+                                              SCENE__FUN("contact", scene__read_contact),
+                                              SCENE__FUN("bodies", scene__read_bodies),
+                                              SCENE__FUN("planes", scene__read_planes),
+                                              SCENE__FUN("camera", scene__read_camera),
+                                              SCENE__FUN("frames", scene__read_frames),
+                                              SCENE__FUN("run", scene__read_run),
+                                              SCENE__END};
 
 // world.dim decides how bodies are read, wherever it stands in the file.
 static int scene__read_root(scene__reader *r, const cJSON *root) {
@@ -1315,11 +1429,13 @@ static int scene__line_of(const char *text, const char *at) {
     return line;
 }
 
-static cJSON *scene__tree(const char *name, const char *text, const char *const *set, int sets, scene_error *e) {
+static cJSON *scene__tree(const char *name, const char *text, const char *const *set, int sets,
+                          scene_error *e) {
     const char *end = NULL;
     cJSON *root = text ? cJSON_ParseWithOpts(text, &end, 1) : cJSON_CreateObject();
     if (!root) {
-        scene__fail(e, "%s:%d: this is not JSON, near \"%.20s\"", name, scene__line_of(text, end), end ? end : "");
+        scene__fail(e, "%s:%d: this is not JSON, near \"%.20s\"", name, scene__line_of(text, end),
+                    end ? end : "");
         return NULL;
     }
     for (int k = 0; k < sets; k++)
@@ -1332,8 +1448,8 @@ static cJSON *scene__tree(const char *name, const char *text, const char *const 
 
 // ---------------------------------------------------------------------------------------------
 // >>scene_script (private)
-// The scripts of the IPC reference code: a line is a word and its arguments. Shapes are placed when the
-// whole file is known (rotateModel, size, then the named script).
+// The scripts of the IPC reference code: a line is a word and its arguments. Shapes are placed
+// when the whole file is known (rotateModel, size, then the named script).
 // ---------------------------------------------------------------------------------------------
 
 #define SCENE__WORDS 64
@@ -1344,12 +1460,12 @@ typedef struct scene__ipc {
     int line, words;
     char text[1024], *word[SCENE__WORDS];
     double duration, density, E, nu, size, axis[3], degrees, damping_stiff, damping_ratio, beta;
-    int energy;      // a scene__materials number
+    int energy;  // a scene__materials number
 } scene__ipc;
 
 static int scene__script_fail(scene__ipc *p, const char *what) {
-    return scene__fail(p->r.error, "%s:%d: %s: %s", p->r.s->file, p->line, p->words ? p->word[0] : "end of file",
-                       what);
+    return scene__fail(p->r.error, "%s:%d: %s: %s", p->r.s->file, p->line,
+                       p->words ? p->word[0] : "end of file", what);
 }
 
 // Splits the next line that has a word; 0 at the end of the text.
@@ -1406,7 +1522,8 @@ static int scene__do_energy(scene__ipc *p) {
 static int scene__do_time(scene__ipc *p) {
     double v[2];
     if (!scene__numbers(p, 1, 2, v)) return 0;
-    if (!(v[0] >= 0 && v[1] > 0)) return scene__script_fail(p, "expected duration >= 0 and step > 0");
+    if (!(v[0] >= 0 && v[1] > 0))
+        return scene__script_fail(p, "expected duration >= 0 and step > 0");
     p->duration = v[0], p->r.s->world.dt = v[1];
     return 1;
 }
@@ -1420,7 +1537,9 @@ static int scene__do_stiffness(scene__ipc *p) {
     double v[2];
     if (!scene__numbers(p, 1, 2, v)) return 0;
     p->E = v[0], p->nu = v[1];
-    return v[0] > 0 && v[1] > -1 && v[1] < 0.5 ? 1 : scene__script_fail(p, "expected E > 0 and -1 < nu < 0.5");
+    return v[0] > 0 && v[1] > -1 && v[1] < 0.5
+               ? 1
+               : scene__script_fail(p, "expected E > 0 and -1 < nu < 0.5");
 }
 
 static int scene__do_integration(scene__ipc *p) {
@@ -1430,7 +1549,9 @@ static int scene__do_integration(scene__ipc *p) {
     if (strcmp(w, "NM") != 0) return scene__script_fail(p, "expected BE or NM");
     p->r.s->world.integrator = TSS_NEWMARK;
     if (p->words > 2 && !scene__numbers(p, 2, 2, v)) return 0;
-    return v[0] == 0.25 && v[1] == 0.5 ? 1 : scene__script_fail(p, "only beta = 0.25, gamma = 0.5 can be had");
+    return v[0] == 0.25 && v[1] == 0.5
+               ? 1
+               : scene__script_fail(p, "only beta = 0.25, gamma = 0.5 can be had");
 }
 
 static int scene__do_damping_stiff(scene__ipc *p) {
@@ -1457,7 +1578,8 @@ static int scene__do_epsv(scene__ipc *p) { return scene__positive(p, &p->r.s->co
 static int scene__do_tuning(scene__ipc *p) {
     double v[16] = {0}, n;
     if (!scene__numbers(p, 1, 1, &n)) return 0;
-    if (!(n >= 0 && n <= 16 && n == floor(n))) return scene__script_fail(p, "expected a count up to 16");
+    if (!(n >= 0 && n <= 16 && n == floor(n)))
+        return scene__script_fail(p, "expected a count up to 16");
     if (!scene__more_numbers(p, (int)n, v)) return 0;
     if (n > 1 && v[1] > 0) p->r.s->contact.dhat_rel = v[1];
     if (n > 4 && v[4] > 0) p->r.s->contact.eps_v_rel = v[4];
@@ -1467,7 +1589,8 @@ static int scene__do_tuning(scene__ipc *p) {
 static int scene__do_tol(scene__ipc *p) {
     double v[16] = {0}, n;
     if (!scene__numbers(p, 1, 1, &n)) return 0;
-    if (!(n >= 0 && n <= 16 && n == floor(n))) return scene__script_fail(p, "expected a count up to 16");
+    if (!(n >= 0 && n <= 16 && n == floor(n)))
+        return scene__script_fail(p, "expected a count up to 16");
     if (!scene__more_numbers(p, (int)n, v)) return 0;
     if (n > 0 && !(v[0] > 0)) return scene__script_fail(p, "expected a tolerance > 0");
     if (n > 0) p->r.s->solver.tol_rel = v[0];
@@ -1498,7 +1621,9 @@ static int scene__do_half_space(scene__ipc *p) {
     if (!h) return 0;
     for (int c = 0; c < 3; c++) h->origin[c] = v[c], h->normal[c] = v[3 + c];
     h->mu = v[7];
-    return scene__unit(h->normal) && h->mu >= 0 ? 1 : scene__script_fail(p, "expected a normal and friction >= 0");
+    return scene__unit(h->normal) && h->mu >= 0
+               ? 1
+               : scene__script_fail(p, "expected a normal and friction >= 0");
 }
 
 static int scene__do_ground(scene__ipc *p) {
@@ -1510,8 +1635,12 @@ static int scene__do_ground(scene__ipc *p) {
     return h->mu >= 0 ? 1 : scene__script_fail(p, "expected friction >= 0");
 }
 
-static int scene__do_self_on(scene__ipc *p) { return p->r.s->contact.self = p->r.s->contact.between = 1; }
-static int scene__do_self_off(scene__ipc *p) { return p->r.s->contact.self = p->r.s->contact.between = 0, 1; }
+static int scene__do_self_on(scene__ipc *p) {
+    return p->r.s->contact.self = p->r.s->contact.between = 1;
+}
+static int scene__do_self_off(scene__ipc *p) {
+    return p->r.s->contact.self = p->r.s->contact.between = 0, 1;
+}
 
 static int scene__do_self_friction(scene__ipc *p) {
     double mu;
@@ -1539,8 +1668,10 @@ static int scene__do_collider(scene__ipc *p) {
     scene_body b;
     if (p->words < 2) return scene__script_fail(p, "expected a file");
     if (!scene__numbers(p, 2, 6, v)) return 0;
-    if (p->words > 8 && strcmp(p->word[8], "rotate") == 0 && !scene__numbers(p, 9, 3, turn)) return 0;
-    if (!(v[3] > 0 && v[5] >= 0)) return scene__script_fail(p, "expected scale > 0 and friction >= 0");
+    if (p->words > 8 && strcmp(p->word[8], "rotate") == 0 && !scene__numbers(p, 9, 3, turn))
+        return 0;
+    if (!(v[3] > 0 && v[5] >= 0))
+        return scene__script_fail(p, "expected scale > 0 and friction >= 0");
     scene__body_named(p, &b, p->word[1]);
     if (!scene__body_load(p, &b, p->word[1])) return 0;
     b.obstacle = b.collider = 1, b.mu = v[5];
@@ -1567,7 +1698,7 @@ static void scene__turning(scene_motion *m, const double *velocity, const double
     }
 }
 
-// DBC lower(3) upper(3) velocity(3) degrees/s(3) [start [end]]: nodes of the surface, in the file's frame.
+// DBC lower(3) upper(3) velocity(3) degrees/s(3) [start [end]]: surface nodes, file's frame.
 // NBC lower(3) upper(3) acceleration(3) [start [end]]
 static int scene__boundary(scene__ipc *p, scene_body *b, int k, int *used) {
     int dirichlet = p->word[k][0] == 'D', n = dirichlet ? 12 : 9, nodes;
@@ -1592,7 +1723,8 @@ static int scene__boundary(scene__ipc *p, scene_body *b, int k, int *used) {
         return dirichlet ? scene__add_pin(b, &it, node, nodes, 7, p->r.error)
                          : scene__add_force(b, &it, node, nodes, p->r.error);
     free(node);
-    scene__warn(p->r.s, "%s:%d: no node is in the box of this %s", p->r.s->file, p->line, p->word[k]);
+    scene__warn(p->r.s, "%s:%d: no node is in the box of this %s", p->r.s->file, p->line,
+                p->word[k]);
     return 1;
 }
 
@@ -1604,7 +1736,8 @@ static int scene__shape_option(scene__ipc *p, scene_body *b, int k, int *used) {
         if (!scene__numbers(p, k + 1, 3, v)) return 0;
         if (!(v[0] > 0 && v[1] > 0)) return 1;  // as in the reference: the default then
         b->material.rho = v[0], b->material.E = v[1], b->material.nu = v[2];
-        return v[2] > -1 && v[2] < 0.5 ? 1 : scene__script_fail(p, "material: expected -1 < nu < 0.5");
+        return v[2] > -1 && v[2] < 0.5 ? 1
+                                       : scene__script_fail(p, "material: expected -1 < nu < 0.5");
     }
     if (strcmp(w, "initVel") == 0) {
         *used = 7;
@@ -1618,12 +1751,12 @@ static int scene__shape_option(scene__ipc *p, scene_body *b, int k, int *used) {
         return 1;
     }
     if (strcmp(w, "DBC") == 0 || strcmp(w, "NBC") == 0) return scene__boundary(p, b, k, used);
-    static const char *const known[] = {"material", "initVel", "linearVelocity", "angularVelocity", "DBC",
-                                        "NBC", NULL};
+    static const char *const known[] = {
+        "material", "initVel", "linearVelocity", "angularVelocity", "DBC", "NBC", NULL};
     char hint[200];
     scene__suggest(w, known, hint, sizeof hint);
-    return scene__fail(p->r.error, "%s:%d: no such option of a shape: \"%.40s\"; %s", p->r.s->file, p->line, w,
-                       hint);
+    return scene__fail(p->r.error, "%s:%d: no such option of a shape: \"%.40s\"; %s", p->r.s->file,
+                       p->line, w, hint);
 }
 
 // file translation(3) degrees(3) scale(3) [options]: x ← R (s ∘ x) + t.
@@ -1645,7 +1778,8 @@ static int scene__shape_line(scene__ipc *p, scene_body *b, double *v) {
 
 static int scene__do_shapes(scene__ipc *p) {
     double n, v[9];
-    if (p->words < 3 || strcmp(p->word[1], "input") != 0) return scene__script_fail(p, "expected `input N`");
+    if (p->words < 3 || strcmp(p->word[1], "input") != 0)
+        return scene__script_fail(p, "expected `input N`");
     if (!scene__numbers(p, 2, 1, &n)) return 0;
     for (int k = 0; k < (int)n; k++) {
         scene_body b;
@@ -1662,7 +1796,8 @@ static int scene__repeat(scene__ipc *p, const scene_body *b, double x, double y,
     c.pin = NULL, c.force = NULL, c.pins = c.forces = 0;
     memset(&none, 0, sizeof none);
     none.dim = b->mesh.dim;
-    if (tss_mesh_merge(&b->mesh, &none, &c.mesh) != TSS_OK) return scene__fail(p->r.error, "out of memory");
+    if (tss_mesh_merge(&b->mesh, &none, &c.mesh) != TSS_OK)
+        return scene__fail(p->r.error, "out of memory");
     tss_mesh_translate(&c.mesh, x, y, z);
     char *number = strrchr(c.name, ' ');
     if (number) snprintf(number, sizeof c.name - (size_t)(number - c.name), " %d", p->r.s->bodies);
@@ -1675,7 +1810,8 @@ static int scene__do_matrix(scene__ipc *p) {
     scene_body b;
     if (p->words < 5 || strcmp(p->word[1], "input") != 0)
         return scene__script_fail(p, "expected `input nx ny nz [x y z]`");
-    if (!scene__numbers(p, 2, 3, n) || (p->words > 5 && !scene__numbers(p, 5, p->words > 8 ? 3 : p->words - 5, at)))
+    if (!scene__numbers(p, 2, 3, n) ||
+        (p->words > 5 && !scene__numbers(p, 5, p->words > 8 ? 3 : p->words - 5, at)))
         return 0;
     if (!(n[0] >= 0 && n[1] >= 0 && n[2] >= 0 && n[0] * n[1] * n[2] <= 1e6))
         return scene__script_fail(p, "expected three counts, at most a million shapes");
@@ -1685,7 +1821,8 @@ static int scene__do_matrix(scene__ipc *p) {
     for (int i = 0; ok && i < (int)n[0]; i++)
         for (int j = 0; ok && j < (int)n[1]; j++)
             for (int k = 0; ok && k < (int)n[2]; k++)
-                ok = scene__repeat(p, &b, at[0] + v[0] * (i - 1), at[1] + v[1] * (j - 1), at[2] + v[2] * (k - 1));
+                ok = scene__repeat(p, &b, at[0] + v[0] * (i - 1), at[1] + v[1] * (j - 1),
+                                   at[2] + v[2] * (k - 1));
     scene__body_free(&b);
     return ok;
 }
@@ -1697,17 +1834,19 @@ static int scene__do_section(scene__ipc *p) {
             strcmp(p->word[k], "interiorPoint") == 0)
             return 1;
     while (scene__next_line(p))
-        if (p->words > 1 && strcmp(p->word[0], "section") == 0 && strcmp(p->word[1], "end") == 0) return 1;
+        if (p->words > 1 && strcmp(p->word[0], "section") == 0 && strcmp(p->word[1], "end") == 0)
+            return 1;
     return 1;
 }
 
-static const char *const scene__scripts[] = {"null", "fallNoShift", "fall", "dragright", "twist",
-                                             "stretchAndPause", "DCOFix", "DCOSegBedSquash", NULL};
+static const char *const scene__scripts[] = {"null",      "fallNoShift",     "fall",
+                                             "dragright", "twist",           "stretchAndPause",
+                                             "DCOFix",    "DCOSegBedSquash", NULL};
 
 static int scene__do_script(scene__ipc *p) {
-    static const scene_script which[] = {SCENE_SCRIPT_NONE, SCENE_SCRIPT_NONE, SCENE_SCRIPT_FALL,
-                                         SCENE_SCRIPT_DRAGRIGHT, SCENE_SCRIPT_TWIST, SCENE_SCRIPT_STRETCH,
-                                         SCENE_SCRIPT_NONE, SCENE_SCRIPT_SQUASH};
+    static const scene_script which[] = {
+        SCENE_SCRIPT_NONE,  SCENE_SCRIPT_NONE,    SCENE_SCRIPT_FALL, SCENE_SCRIPT_DRAGRIGHT,
+        SCENE_SCRIPT_TWIST, SCENE_SCRIPT_STRETCH, SCENE_SCRIPT_NONE, SCENE_SCRIPT_SQUASH};
     char hint[300], what[400];
     const char *w = p->words > 1 ? p->word[1] : "";
     for (int k = 0; scene__scripts[k]; k++)
@@ -1727,19 +1866,37 @@ typedef struct scene__command {
     int (*run)(scene__ipc *p);
 } scene__command;
 
-static const scene__command scene__commands[] = {
-    {"energy", scene__do_energy}, {"time", scene__do_time}, {"density", scene__do_density},
-    {"stiffness", scene__do_stiffness}, {"timeIntegration", scene__do_integration},
-    {"dampingStiff", scene__do_damping_stiff}, {"dampingRatio", scene__do_damping_ratio},
-    {"turnOffGravity", scene__do_no_gravity}, {"dHat", scene__do_dhat}, {"epsv", scene__do_epsv},
-    {"tuning", scene__do_tuning}, {"tol", scene__do_tol}, {"fricIterAmt", scene__do_friction_iterations},
-    {"size", scene__do_size}, {"rotateModel", scene__do_rotate}, {"halfSpace", scene__do_half_space},
-    {"ground", scene__do_ground}, {"meshCO", scene__do_collider}, {"shapes", scene__do_shapes},
-    {"shapeMatrix", scene__do_matrix}, {"selfCollisionOn", scene__do_self_on},
-    {"selfCollisionOff", scene__do_self_off}, {"selfFric", scene__do_self_friction},
-    {"section", scene__do_section}, {"script", scene__do_script}, {"warmStart", scene__do_skip},
-    {"constraintSolver", scene__do_skip}, {"view", scene__do_skip}, {"zoom", scene__do_skip},
-    {"cameraTracking", scene__do_skip}, {"playBackSpeed", scene__do_skip}};
+static const scene__command scene__commands[] = {{"energy", scene__do_energy},
+                                                 {"time", scene__do_time},
+                                                 {"density", scene__do_density},
+                                                 {"stiffness", scene__do_stiffness},
+                                                 {"timeIntegration", scene__do_integration},
+                                                 {"dampingStiff", scene__do_damping_stiff},
+                                                 {"dampingRatio", scene__do_damping_ratio},
+                                                 {"turnOffGravity", scene__do_no_gravity},
+                                                 {"dHat", scene__do_dhat},
+                                                 {"epsv", scene__do_epsv},
+                                                 {"tuning", scene__do_tuning},
+                                                 {"tol", scene__do_tol},
+                                                 {"fricIterAmt", scene__do_friction_iterations},
+                                                 {"size", scene__do_size},
+                                                 {"rotateModel", scene__do_rotate},
+                                                 {"halfSpace", scene__do_half_space},
+                                                 {"ground", scene__do_ground},
+                                                 {"meshCO", scene__do_collider},
+                                                 {"shapes", scene__do_shapes},
+                                                 {"shapeMatrix", scene__do_matrix},
+                                                 {"selfCollisionOn", scene__do_self_on},
+                                                 {"selfCollisionOff", scene__do_self_off},
+                                                 {"selfFric", scene__do_self_friction},
+                                                 {"section", scene__do_section},
+                                                 {"script", scene__do_script},
+                                                 {"warmStart", scene__do_skip},
+                                                 {"constraintSolver", scene__do_skip},
+                                                 {"view", scene__do_skip},
+                                                 {"zoom", scene__do_skip},
+                                                 {"cameraTracking", scene__do_skip},
+                                                 {"playBackSpeed", scene__do_skip}};
 #define SCENE__COMMANDS ((int)(sizeof scene__commands / sizeof *scene__commands))
 
 static int scene__command_line(scene__ipc *p) {
@@ -1751,8 +1908,8 @@ static int scene__command_line(scene__ipc *p) {
     }
     names[SCENE__COMMANDS] = NULL;
     scene__suggest(p->word[0], names, hint, sizeof hint);
-    return scene__fail(p->r.error, "%s:%d: no such keyword: \"%.40s\"; %s", p->r.s->file, p->line, p->word[0],
-                       hint);
+    return scene__fail(p->r.error, "%s:%d: no such keyword: \"%.40s\"; %s", p->r.s->file, p->line,
+                       p->word[0], hint);
 }
 
 // The box of all shapes; meshCO is not one.
@@ -1783,7 +1940,8 @@ static int scene__rotate_model(scene__ipc *p) {
         b->rest = (double *)malloc(bytes + 1);
         if (!b->rest) return scene__fail(p->r.error, "out of memory");
         memcpy(b->rest, b->mesh.x, bytes);
-        for (int i = 0; i < b->mesh.nodes; i++) scene_pose(&turn, 1, b->rest + 3 * i, b->mesh.x + 3 * i);
+        for (int i = 0; i < b->mesh.nodes; i++)
+            scene_pose(&turn, 1, b->rest + 3 * i, b->mesh.x + 3 * i);
     }
     return 1;
 }
@@ -1827,7 +1985,8 @@ static int scene__place(scene__ipc *p) {
         scene_body *b = &s->body[k];
         b->material.kind = (tss_material_kind)p->energy;
         b->material.damping = damping;
-        if (!(b->material.E > 0)) b->material.E = p->E, b->material.nu = p->nu, b->material.rho = p->density;
+        if (!(b->material.E > 0))
+            b->material.E = p->E, b->material.nu = p->nu, b->material.rho = p->density;
     }
     if (p->degrees != 0 && !scene__rotate_model(p)) return 0;
     scene__resize(p);
@@ -1858,9 +2017,10 @@ static void scene__defaults(scene *s, const char *file) {
     tss_world_def d = tss_world_def_default();
     memset(s, 0, sizeof *s);
     snprintf(s->file, sizeof s->file, "%s", file);
-    s->world.dim = 3, s->world.steps = 100, s->world.dt = d.dt, s->world.integrator = d.integrator;
+    s->world.dim = 3, s->world.steps = 100, s->world.dt = d.dt,
+    s->world.integrator = (int)d.integrator;
     memcpy(s->world.gravity, d.gravity, sizeof s->world.gravity);
-    s->solver.tol_rel = d.tol_rel, s->solver.pcg_tol = d.pcg_tol, s->solver.linear = d.linear;
+    s->solver.tol_rel = d.tol_rel, s->solver.pcg_tol = d.pcg_tol, s->solver.linear = (int)d.linear;
     s->solver.max_iterations = d.max_iterations, s->solver.pcg_iterations = d.pcg_iterations;
     s->contact.enabled = s->contact.self = s->contact.between = s->contact.friction_iterations = 1;
     s->contact.dhat_edge = tss_ipc_def_default().dhat_edge;
@@ -1870,8 +2030,8 @@ static void scene__defaults(scene *s, const char *file) {
     s->run.every = 1;
 }
 
-int scene_parse(scene *s, const char *name, const char *text, const char *assets, const char *const *set,
-                int sets, scene_error *error) {
+int scene_parse(scene *s, const char *name, const char *text, const char *assets,
+                const char *const *set, int sets, scene_error *error) {
     scene__reader r;
     int json = text[strspn(text, " \t\r\n")] == '{';
     scene__defaults(s, name);
@@ -1929,13 +2089,15 @@ static double *scene__pack(const double *x, int n, int dim) {
 static double *scene__velocities(const scene_body *b, int dim, int *ok) {
     double c[3], u[3], turns = fabs(b->angular[0]) + fabs(b->angular[1]) + fabs(b->angular[2]);
     const double *w = b->angular;
-    double *v = turns > 0 ? (double *)malloc(((size_t)b->mesh.nodes + 1) * (size_t)dim * sizeof *v) : NULL;
+    double *v =
+        turns > 0 ? (double *)malloc(((size_t)b->mesh.nodes + 1) * (size_t)dim * sizeof *v) : NULL;
     *ok = v || turns == 0;
     scene__middle(b->mesh.x, b->mesh.nodes, c);
     for (int i = 0; v && i < b->mesh.nodes; i++) {
         const double *x = b->mesh.x + 3 * i;
         double d[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]};
-        u[0] = w[1] * d[2] - w[2] * d[1], u[1] = w[2] * d[0] - w[0] * d[2], u[2] = w[0] * d[1] - w[1] * d[0];
+        u[0] = w[1] * d[2] - w[2] * d[1], u[1] = w[2] * d[0] - w[0] * d[2],
+        u[2] = w[0] * d[1] - w[1] * d[0];
         for (int k = 0; k < dim; k++) v[i * dim + k] = b->velocity[k] + u[k];
     }
     return v;
@@ -1971,8 +2133,8 @@ static int scene__add_to_world(const scene *s, scene_body *b, tss_world *w, scen
 }
 
 // Nodes (of the body; NULL: all) that shall move.
-static scene_driven *scene__add_driven(scene *s, int body, const int *node, int nodes, const scene_motion *m,
-                                       scene_error *e) {
+static scene_driven *scene__add_driven(scene *s, int body, const int *node, int nodes,
+                                       const scene_motion *m, scene_error *e) {
     const scene_body *b = &s->body[body];
     void *p = scene__grow(s->driven, s->drivens, sizeof *s->driven, e);
     if (!p) return NULL;
@@ -2014,13 +2176,13 @@ static int scene__add_pins(scene *s, int k, tss_world *w, scene_error *e) {
 }
 
 // The nodes of body k whose x is below (side < 0) or above the given fraction of the box's x range.
-static int scene__drive_end(scene *s, int k, const double *x, double lo, double hi, double part, int side,
-                            const scene_motion *m, scene_error *e) {
+static int scene__drive_end(scene *s, int k, const double *x, double lo, double hi, double part,
+                            int side, const scene_motion *m, scene_error *e) {
     int n = 0, nodes = s->body[k].mesh.nodes;
     int *node = (int *)malloc(((size_t)nodes + 1) * sizeof *node);
     for (int i = 0; node && i < nodes; i++) {
         double at = x[3 * i];
-        int left = at < lo + (hi - lo) * part, right = at > hi - (hi - lo) * part;
+        int left = at<lo + (hi - lo) * part, right = at> hi - (hi - lo) * part;
         if (side < 0 ? left : right && !left) node[n++] = i;
     }
     scene_driven *d = node && n > 0 ? scene__add_driven(s, k, node, n, m, e) : NULL;
@@ -2030,7 +2192,8 @@ static int scene__drive_end(scene *s, int k, const double *x, double lo, double 
 }
 
 static int scene__script_ends(scene *s, scene_error *e) {
-    double lo[3], hi[3], rest_lo[3], rest_hi[3], part = s->script == SCENE_SCRIPT_DRAGRIGHT ? 0.04 : 0.01;
+    double lo[3], hi[3], rest_lo[3], rest_hi[3],
+        part = s->script == SCENE_SCRIPT_DRAGRIGHT ? 0.04 : 0.01;
     int ok = 1;
     scene__shapes_box(s, 0, lo, hi);
     scene__shapes_box(s, 1, rest_lo, rest_hi);
@@ -2041,7 +2204,8 @@ static int scene__script_ends(scene *s, scene_error *e) {
             memset(&m, 0, sizeof m);
             m.moves = m.has_pivot = 1, m.end = INFINITY;
             for (int c = 0; c < 3; c++) m.pivot[c] = 0.5 * (rest_lo[c] + rest_hi[c]);
-            if (s->script == SCENE_SCRIPT_TWIST) m.angular[0] = side * 72 * SCENE__RADIAN;  // 0.4π rad/s
+            if (s->script == SCENE_SCRIPT_TWIST)
+                m.angular[0] = side * 72 * SCENE__RADIAN;  // 0.4π rad/s
             if (s->script == SCENE_SCRIPT_STRETCH) m.velocity[0] = side;
             if (s->script == SCENE_SCRIPT_DRAGRIGHT) m.velocity[0] = 0.5;
             if (s->script == SCENE_SCRIPT_DRAGRIGHT && side < 0) continue;
@@ -2082,7 +2246,8 @@ static tss_world_def scene__world_def(const scene *s, const tss_host *host) {
     if (host) d.host = *host;
     d.dim = s->world.dim, d.dt = s->world.dt, d.integrator = (tss_integrator)s->world.integrator;
     memcpy(d.gravity, s->world.gravity, sizeof d.gravity);
-    d.tol = s->solver.tol, d.tol_rel = s->solver.tol_rel, d.max_iterations = s->solver.max_iterations;
+    d.tol = s->solver.tol, d.tol_rel = s->solver.tol_rel,
+    d.max_iterations = s->solver.max_iterations;
     d.linear = (tss_linear)s->solver.linear;
     d.pcg_tol = s->solver.pcg_tol, d.pcg_iterations = s->solver.pcg_iterations;
     return d;
@@ -2141,8 +2306,9 @@ static int scene__add_contact(scene *s, tss_world *w, tss_ipc **ipc, scene_error
     free(plane), free(body), free(pair);
     return r == TSS_OK ? 1 : scene__world_fail(e, s, w, r);
 }
-int scene_build(scene *s, const tss_host *host, void (*on_iterate)(const double *, const double *, void *),
-                void *ctx, tss_world **out, tss_ipc **ipc, scene_error *error) {
+int scene_build(scene *s, const tss_host *host,
+                void (*on_iterate)(const double *, const double *, void *), void *ctx,
+                tss_world **out, tss_ipc **ipc, scene_error *error) {
     tss_world_def d = scene__world_def(s, host);
     tss_world *w = NULL;
     int forces = 0;
@@ -2162,8 +2328,10 @@ int scene_build(scene *s, const tss_host *host, void (*on_iterate)(const double 
     s->forces_on = (char *)calloc((size_t)forces + 1, 1);
     if (ok && !s->forces_on) ok = scene__fail(error, "out of memory");
     if (ok && (r = tss_world_prepare(w)) != TSS_OK) ok = scene__world_fail(error, s, w, r);
-    if (ok) *out = w;
-    else tss_world_destroy(w);
+    if (ok)
+        *out = w;
+    else
+        tss_world_destroy(w);
     return ok;
 }
 
@@ -2172,8 +2340,8 @@ int scene_build(scene *s, const tss_host *host, void (*on_iterate)(const double 
 // ---------------------------------------------------------------------------------------------
 
 // Coordinate c of the nodes of those bodies that `of` accepts: smallest and largest.
-static void scene__range(const scene *s, const tss_world *w, int (*of)(const scene *, int), int c, double *lo,
-                         double *hi) {
+static void scene__range(const scene *s, const tss_world *w, int (*of)(const scene *, int), int c,
+                         double *lo, double *hi) {
     const double *x = tss_world_positions(w);
     *lo = INFINITY, *hi = -INFINITY;
     for (int k = 0; k < s->bodies; k++)
@@ -2185,7 +2353,9 @@ static void scene__range(const scene *s, const tss_world *w, int (*of)(const sce
 
 static int scene__is_collider(const scene *s, int k) { return s->body[k].collider; }
 static int scene__is_shape(const scene *s, int k) { return !s->body[k].collider; }
-static int scene__is_upper(const scene *s, int k) { return s->body[k].obstacle && scene__later_half(s, k); }
+static int scene__is_upper(const scene *s, int k) {
+    return s->body[k].obstacle && scene__later_half(s, k);
+}
 static int scene__is_lower(const scene *s, int k) {
     return s->body[k].obstacle && !s->body[k].collider && !scene__later_half(s, k);
 }
@@ -2220,7 +2390,8 @@ static tss_result scene__free_nodes(const scene *s, const scene_driven *d, tss_w
 static void scene__capture(const scene *s, scene_driven *d, const tss_world *w) {
     const double *x = tss_world_positions(w);
     for (int i = 0; i < d->count; i++)
-        for (int c = 0; c < s->world.dim; c++) d->from[3 * i + c] = x[d->node[i] * s->world.dim + c];
+        for (int c = 0; c < s->world.dim; c++)
+            d->from[3 * i + c] = x[d->node[i] * s->world.dim + c];
     if (!d->motion.has_pivot) scene__middle(d->from, d->count, d->motion.pivot);
 }
 
@@ -2264,7 +2435,8 @@ static tss_result scene__apply_forces(const scene *s, tss_world *w) {
                 int at = s->body[b].first + g->node[i];
                 has[at] = 1;
                 for (int c = 0; c < 3 && s->forces_on[k]; c++)
-                    f[3 * at + c] += g->force[c] / g->nodes + g->acceleration[c] * tss_world_masses(w)[at];
+                    f[3 * at + c] +=
+                        g->force[c] / g->nodes + g->acceleration[c] * tss_world_masses(w)[at];
             }
         }
     for (int i = 0; i < n && r == TSS_OK; i++)
@@ -2289,7 +2461,8 @@ static tss_result scene__drive_forces(scene *s, tss_world *w) {
 int scene_drive(scene *s, tss_world *w, scene_error *error) {
     int gate = scene__gate(s, w);
     tss_result r = scene__drive_forces(s, w);
-    for (int k = 0; k < s->drivens && r == TSS_OK; k++) r = scene__drive_one(s, &s->driven[k], w, gate);
+    for (int k = 0; k < s->drivens && r == TSS_OK; k++)
+        r = scene__drive_one(s, &s->driven[k], w, gate);
     if (r == TSS_OK) r = tss_world_prepare(w);  // kinds of nodes may have changed
     return r == TSS_OK ? 1 : scene__world_fail(error, s, w, r);
 }

@@ -1,17 +1,20 @@
 /* tss: runs scenes without writing C.
 
-   tss run SCENE [-o DIR] [--steps N] [--threads N] [--budget-ms T] [--frames png,vtu,obj] [--every K]
-                 [--resume FILE] [--assets DIR] [--set key=value]... [--check]
+   tss run SCENE [-o DIR] [--steps N] [--threads N] [--budget-ms T] [--frames png,vtu,obj]
+                 [--every K] [--resume FILE] [--assets DIR] [--set key=value]... [--check]
    tss check SCENE [--assets DIR] [--set key=value]...
    tss --version | --help
 
-   SCENE is JSON or a script of the IPC reference code; scene.h lists every key. run leaves in DIR (out/NAME)
-   stats.csv: a row a step; frames/NNNN.png, vtu/ with a .pvd, obj/: a picture each K steps; checkpoint.bin
-   and report.html. It ends with the 64-bit hash of positions and velocities: the same for any number of
-   threads. --check hands every accepted iterate to an independent judge (tests/checker.h).
+   SCENE is JSON or a script of the IPC reference code; scene.h lists every key. run leaves in DIR
+   (out/NAME) stats.csv: a row a step; frames/NNNN.png, vtu/ with frames.pvd, obj/: one each K steps;
+   checkpoint.bin and report.html. It ends with the 64-bit hash of positions and velocities: the same
+   for any number of threads. --check hands every accepted iterate to an independent judge
+   (tests/checker.h). check is the doctor: it says what is wrong with a scene, and takes no step.
 
-   EXIT  0 well; 1 check found something; 2 the scene or a file is at fault; 3 a step did not meet its
-   tolerance; 4 the judge found a violation.                                                         */
+   EXIT  0 well; 1 the doctor found an error; 2 a file, key or option is at fault; 3 a step did not
+   meet its tolerance; 4 the judge found a violation or could not decide.
+
+   >>options  >>run  >>judge  >>frames  >>stats  >>checkpoints  >>summary  >>main              */
 #define _POSIX_C_SOURCE 200809L
 #define TSS_IMPLEMENTATION
 #include "tss.h"
@@ -52,11 +55,13 @@ typedef struct options {
 } options;
 
 static int usage(FILE *to) {
-    fputs("usage: tss run SCENE [-o DIR] [--steps N] [--threads N] [--budget-ms T]\n"
-          "               [--frames png,vtu,obj] [--every K] [--resume FILE] [--assets DIR]\n"
-          "               [--set key=value]... [--check]\n"
-          "       tss check SCENE [--assets DIR] [--set key=value]...\n"
-          "       tss --version\n", to);
+    fputs(
+        "usage: tss run SCENE [-o DIR] [--steps N] [--threads N] [--budget-ms T]\n"
+        "               [--frames png,vtu,obj] [--every K] [--resume FILE] [--assets DIR]\n"
+        "               [--set key=value]... [--check]\n"
+        "       tss check SCENE [--assets DIR] [--set key=value]...\n"
+        "       tss --version\n",
+        to);
     return to == stdout ? 0 : 2;
 }
 
@@ -102,23 +107,30 @@ static int complain(const char *what, const char *value, const char *expected) {
 
 // One option and its value; 0: bad.
 static int take(options *o, const char *name, const char *value) {
-    static const struct { const char *name; int least; size_t to; } counts[] = {
-        {"--steps", 0, offsetof(options, steps)}, {"--threads", 1, offsetof(options, threads)},
-        {"--every", 1, offsetof(options, every)}};
+    static const struct {
+        const char *name;
+        int least;
+        size_t to;
+    } counts[] = {{"--steps", 0, offsetof(options, steps)},
+                  {"--threads", 1, offsetof(options, threads)},
+                  {"--every", 1, offsetof(options, every)}};
     if (!value) return complain(name, "", "a value");
     for (size_t k = 0; k < sizeof counts / sizeof *counts; k++)
         if (strcmp(name, counts[k].name) == 0)
             return whole(value, counts[k].least, (int *)(void *)((char *)o + counts[k].to)) ||
-                   complain(name, value, counts[k].least ? "a whole number >= 1" : "a whole number >= 0");
+                   complain(name, value,
+                            counts[k].least ? "a whole number >= 1" : "a whole number >= 0");
     if (strcmp(name, "-o") == 0) return snprintf(o->out, sizeof o->out, "%s", value) > 0;
     if (strcmp(name, "--assets") == 0) return o->assets = value, 1;
     if (strcmp(name, "--frames") == 0) return o->frames = value, 1;
     if (strcmp(name, "--resume") == 0) return o->resume = value, 1;
     if (strcmp(name, "--set") == 0)
-        return o->sets < MAX_SETS ? (o->set[o->sets++] = value, 1) : complain(name, value, "no more than 256");
+        return o->sets < MAX_SETS ? (o->set[o->sets++] = value, 1)
+                                  : complain(name, value, "no more than 256");
     if (strcmp(name, "--budget-ms") == 0)
         return tss_parse_double(value, strlen(value), &o->budget_ms) == TSS_OK && o->budget_ms > 0
-                   ? 1 : complain(name, value, "milliseconds > 0");
+                   ? 1
+                   : complain(name, value, "milliseconds > 0");
     return complain("option", name, "one of those `tss --help` lists");
 }
 
@@ -127,12 +139,15 @@ static int read_options(int argc, char **argv, options *o) {
     o->steps = -1;
     o->command = argv[1];
     for (int k = 2; k < argc; k++) {
-        if (strcmp(argv[k], "--check") == 0) o->check = 1;
+        if (strcmp(argv[k], "--check") == 0)
+            o->check = 1;
         else if (argv[k][0] == '-' && argv[k][1]) {
             if (!take(o, argv[k], argv[k + 1])) return 0;
             k++;
-        } else if (!o->scene) o->scene = argv[k];
-        else return complain("argument", argv[k], "one scene");
+        } else if (!o->scene)
+            o->scene = argv[k];
+        else
+            return complain("argument", argv[k], "one scene");
     }
     return o->scene ? 1 : complain(o->command, "", "a scene");
 }
@@ -166,7 +181,7 @@ typedef enum column {
 #define COLUMN(id, value) COL_##id,
     COLUMNS(COLUMN)
 #undef COLUMN
-    COLUMN_COUNT
+        COLUMN_COUNT
 } column;
 
 static const char *const column_names[] = {
@@ -185,23 +200,23 @@ typedef struct run {
     scene_error why;
     tss_world *w;
     tss_ipc *ipc;
-    int step, failed;            // failed: steps that did not converge
-    char worst[300];             // the first of them
+    int step, failed;  // failed: steps that did not converge
+    char worst[300];   // the first of them
     row *rows;
     int row_count;
     FILE *csv;
     int png, vtu, obj, terminal;
     view *view;
     view_camera camera;
-    double *x3, *field;          // positions with three coordinates; the scalar to show
-    tss_mesh all, skin;          // for .vtu and .obj
-    char **pictures, **states;   // files written
+    double *x3, *field;         // positions with three coordinates; the scalar to show
+    tss_mesh all, skin;         // for .vtu and .obj
+    char **pictures, **states;  // files written
     double *picture_times, *state_times;
     int picture_count, state_count;
-    check *judge, *lenient;      // lenient: cells whose material has no barrier
+    check *judge, *lenient;  // lenient: cells whose material has no barrier
     unsigned char *kinematic;
     int *node_body;
-    int *skin_first;             // triangles of each body in skin: skin_first[b] .. skin_first[b + 1]
+    int *skin_first;  // triangles of each body in skin: skin_first[b] .. skin_first[b + 1]
     double *halfspaces;
     double started;
 } run;
@@ -269,7 +284,8 @@ static int open_folders(run *r) {
     int on[] = {r->png, r->vtu, r->obj};
     char path[600];
     name = name ? name + 1 : r->o.scene;
-    if (!r->o.out[0]) snprintf(r->o.out, sizeof r->o.out, "out/%.*s", (int)strcspn(name, "."), name);
+    if (!r->o.out[0])
+        snprintf(r->o.out, sizeof r->o.out, "out/%.*s", (int)strcspn(name, "."), name);
     if (!make_folder(r, r->o.out)) return 0;
     for (int k = 0; k < 3; k++) {
         snprintf(path, sizeof path, "%s/%s", r->o.out, sub[k]);
@@ -281,10 +297,15 @@ static int open_folders(run *r) {
 static int read_formats(run *r) {
     for (const char *c = r->s.run.frames; *c;) {
         size_t n = strcspn(c, ",");
-        if (n == 3 && strncmp(c, "png", 3) == 0) r->png = 1;
-        else if (n == 3 && strncmp(c, "vtu", 3) == 0) r->vtu = 1;
-        else if (n == 3 && strncmp(c, "obj", 3) == 0) r->obj = 1;
-        else return fail(r, "%s: run.frames is \"%s\", expected some of png,vtu,obj", r->o.scene, r->s.run.frames);
+        if (n == 3 && strncmp(c, "png", 3) == 0)
+            r->png = 1;
+        else if (n == 3 && strncmp(c, "vtu", 3) == 0)
+            r->vtu = 1;
+        else if (n == 3 && strncmp(c, "obj", 3) == 0)
+            r->obj = 1;
+        else
+            return fail(r, "%s: run.frames is \"%s\", expected some of png,vtu,obj", r->o.scene,
+                        r->s.run.frames);
         c += n + (c[n] == ',');
     }
     return 1;
@@ -306,7 +327,7 @@ static int pair_order(const void *a, const void *b) { return memcmp(a, b, 2 * si
 
 // Edges of the surface that belong to no triangle. Returns how many went to out.
 static int loose_edges(const tss_surface *f, int *out) {
-    int n = 0, (*edge)[2] = (int (*)[2])need((size_t)f->triangles * 3, sizeof *edge);
+    int n = 0, (*edge)[2] = (int(*)[2])need((size_t)f->triangles * 3, sizeof *edge);
     for (int k = 0; k < 3 * f->triangles; k++) {
         int a = f->triangle[k], b = f->triangle[k - k % 3 + (k + 1) % 3];
         edge[k][0] = a < b ? a : b, edge[k][1] = a < b ? b : a;
@@ -327,7 +348,8 @@ static int gather_cells(const run *r, int with_barrier, int *out) {
     for (int k = 0; k < r->s.bodies; k++) {
         const scene_body *b = &r->s.body[k];
         tss_body_info info;
-        if (b->obstacle || barrier(b) != with_barrier || tss_body_get(r->w, b->id, &info) != TSS_OK) continue;
+        if (b->obstacle || barrier(b) != with_barrier || tss_body_get(r->w, b->id, &info) != TSS_OK)
+            continue;
         const int *cell = tss_body_cells(r->w, b->id);
         for (int i = 0; i < size * info.cells; i++) out[n++] = cell[i];
     }
@@ -336,7 +358,8 @@ static int gather_cells(const run *r, int with_barrier, int *out) {
 
 static void mark_kinematic(run *r) {
     const uint8_t *kind = tss_world_kinds(r->w);
-    for (int i = 0; r->kinematic && i < tss_world_nodes(r->w); i++) r->kinematic[i] = kind[i] != TSS_NODE_FREE;
+    for (int i = 0; r->kinematic && i < tss_world_nodes(r->w); i++)
+        r->kinematic[i] = kind[i] != TSS_NODE_FREE;
 }
 
 static void judge_planes(run *r, check_mesh *m) {
@@ -350,13 +373,14 @@ static void judge_planes(run *r, check_mesh *m) {
     m->halfspaces = r->halfspaces, m->n_halfspaces = r->s.planes;
 }
 
-// The judge keeps pointers into the world and into r; cells and edges are leaked into r's lifetime.
+// The judge borrows cells until it ends; the caller frees them.
 static int judge_begin(run *r, int *cells[2], int *edges) {
     tss_surface f;
     check_mesh m;
     int n = tss_world_nodes(r->w);
     memset(&m, 0, sizeof m);
-    if (tss_world_surface(r->w, &f) != TSS_OK) return fail(r, "%s: %s", r->o.scene, tss_world_error(r->w));
+    if (tss_world_surface(r->w, &f) != TSS_OK)
+        return fail(r, "%s: %s", r->o.scene, tss_world_error(r->w));
     m.dim = r->s.world.dim, m.nodes = n, m.rest = tss_world_rest(r->w);
     m.cells = cells[1], m.n_cells = gather_cells(r, 1, cells[1]);
     if (r->s.contact.enabled) {
@@ -380,11 +404,12 @@ static int judge_end(run *r) {
     if (r->lenient) b = check_end(r->lenient);
     r->judge = r->lenient = NULL;
     long bad = a.intersections + a.collisions + a.halfspaces + a.breaks + a.range;
-    printf("checked %ld segments: %ld intersections, %ld undecided, %ld inversions, min J %.4g\n", a.segments, bad,
-           a.undecided, a.inversions, fmin(a.min_J, b.min_J));
+    printf("checked %ld segments: %ld intersections, %ld undecided, %ld inversions, min J %.4g\n",
+           a.segments, bad, a.undecided, a.inversions, fmin(a.min_J, b.min_J));
     if (!a.ok) printf("  first: %s\n", check_describe(&a, text, sizeof text));
     if (b.inversions + b.undecided > 0)
-        printf("  %ld inversions and %ld undecided in materials that allow them\n", b.inversions, b.undecided);
+        printf("  %ld inversions and %ld undecided in materials that allow them\n", b.inversions,
+               b.undecided);
     return a.ok;
 }
 
@@ -392,9 +417,9 @@ static int judge_end(run *r) {
 // >>frames
 // ---------------------------------------------------------------------------------------------
 
-static const float body_colors[][3] = {{0.91f, 0.52f, 0.32f}, {0.33f, 0.62f, 0.78f}, {0.55f, 0.72f, 0.40f},
-                                       {0.86f, 0.70f, 0.34f}, {0.66f, 0.50f, 0.74f}, {0.84f, 0.45f, 0.55f},
-                                       {0.40f, 0.70f, 0.66f}, {0.72f, 0.60f, 0.48f}};
+static const float body_colors[][3] = {
+    {0.91f, 0.52f, 0.32f}, {0.33f, 0.62f, 0.78f}, {0.55f, 0.72f, 0.40f}, {0.86f, 0.70f, 0.34f},
+    {0.66f, 0.50f, 0.74f}, {0.84f, 0.45f, 0.55f}, {0.40f, 0.70f, 0.66f}, {0.72f, 0.60f, 0.48f}};
 static const float obstacle_color[3] = {0.56f, 0.58f, 0.62f};
 
 static void positions3(run *r) {
@@ -408,7 +433,8 @@ static void positions3(run *r) {
 static double edges_of(const double *x, const int *cell, int dim, double *D) {
     for (int c = 0; c < 3; c++)
         for (int k = 0; k < 3; k++)
-            D[3 * c + k] = c < dim && k < dim ? x[dim * cell[k + 1] + c] - x[dim * cell[0] + c] : c == k;
+            D[3 * c + k] =
+                c < dim && k < dim ? x[dim * cell[k + 1] + c] - x[dim * cell[0] + c] : c == k;
     return D[0] * (D[4] * D[8] - D[5] * D[7]) - D[1] * (D[3] * D[8] - D[5] * D[6]) +
            D[2] * (D[3] * D[7] - D[4] * D[6]);
 }
@@ -424,12 +450,15 @@ static double equivalent_strain(const double *X, const double *x, const int *cel
         }
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
-            F[3 * i + j] = D[3 * i] * inv[j] + D[3 * i + 1] * inv[3 + j] + D[3 * i + 2] * inv[6 + j];
+            F[3 * i + j] =
+                D[3 * i] * inv[j] + D[3 * i + 1] * inv[3 + j] + D[3 * i + 2] * inv[6 + j];
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
-            E[3 * i + j] = 0.5 * (F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j] - (i == j));
+            E[3 * i + j] =
+                0.5 * (F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j] - (i == j));
     trace = (E[0] + E[4] + E[8]) / 3;
-    for (int i = 0; i < 9; i++) sum += (E[i] - (i % 4 == 0 ? trace : 0)) * (E[i] - (i % 4 == 0 ? trace : 0));
+    for (int i = 0; i < 9; i++)
+        sum += (E[i] - (i % 4 == 0 ? trace : 0)) * (E[i] - (i % 4 == 0 ? trace : 0));
     return sqrt(2.0 / 3 * sum);
 }
 
@@ -456,17 +485,21 @@ static void fill_field(run *r) {
         if (r->s.body[b].obstacle || tss_body_get(r->w, r->s.body[b].id, &info) != TSS_OK) continue;
         const int *cell = tss_body_cells(r->w, r->s.body[b].id);
         for (int k = 0; k < info.cells; k++, cell += dim + 1) {
-            double value = cell_field(r, cell), vol = fabs(edges_of(tss_world_rest(r->w), cell, dim, D));
+            double value = cell_field(r, cell),
+                   vol = fabs(edges_of(tss_world_rest(r->w), cell, dim, D));
             for (int i = 0; i <= dim; i++) r->field[cell[i]] += vol * value, weight[cell[i]] += vol;
         }
     }
-    for (int i = 0; i < n && r->s.frames.field != SCENE_FIELD_VELOCITY; i++) r->field[i] /= weight[i];
+    for (int i = 0; i < n && r->s.frames.field != SCENE_FIELD_VELOCITY; i++)
+        r->field[i] /= weight[i];
     free(weight);
 }
 
 static void field_range(const run *r, double *lo, double *hi) {
     *lo = r->s.frames.field == SCENE_FIELD_J ? 0.5 : 0;
-    *hi = r->s.frames.field == SCENE_FIELD_J ? 1.5 : r->s.frames.field == SCENE_FIELD_STRAIN ? 0.5 : 1;
+    *hi = r->s.frames.field == SCENE_FIELD_J        ? 1.5
+          : r->s.frames.field == SCENE_FIELD_STRAIN ? 0.5
+                                                    : 1;
     if (r->s.frames.has_range) *lo = r->s.frames.range[0], *hi = r->s.frames.range[1];
 }
 
@@ -474,7 +507,8 @@ static view_style body_style(const run *r, int b) {
     const scene_body *body = &r->s.body[b];
     view_style style = view_style_default();
     const float *c = body->color[0] >= 0 ? body->color
-                   : body->obstacle ? obstacle_color : body_colors[b % 8];
+                     : body->obstacle    ? obstacle_color
+                                         : body_colors[b % 8];
     memcpy(style.colour, c, sizeof style.colour);
     style.wire = (float)r->s.frames.wireframe;
     style.crease = body->obstacle ? 30 : 50;
@@ -495,7 +529,8 @@ static void draw_body(run *r, int b) {
     int n = r->s.world.dim == 2 ? m->triangles : r->skin_first[b + 1] - first;
     local = (int *)need(3 * (size_t)n, sizeof *local);
     for (int k = 0; k < 3 * n; k++)
-        local[k] = r->s.world.dim == 2 ? m->triangle[k] : r->skin.triangle[3 * first + k] - body->first;
+        local[k] =
+            r->s.world.dim == 2 ? m->triangle[k] : r->skin.triangle[3 * first + k] - body->first;
     view_add_mesh(r->view, x, m->nodes, local, n, &style);
     if (body->obstacle) view_add_segments(r->view, x, m->nodes, m->edge, m->edges, 0, &style);
     if (body->obstacle) view_add_points(r->view, x, m->nodes, m->point, m->points, 0, &style);
@@ -520,13 +555,16 @@ static void draw_plane(run *r, const scene_plane *p, const double *lo, const dou
         u[c] = n[a] * flat[b] - n[b] * flat[a];
     }
     (void)scene__unit(u);
-    for (int c = 0; c < 3; c++) t[c] = n[(c + 1) % 3] * u[(c + 2) % 3] - n[(c + 2) % 3] * u[(c + 1) % 3];
+    for (int c = 0; c < 3; c++)
+        t[c] = n[(c + 1) % 3] * u[(c + 2) % 3] - n[(c + 2) % 3] * u[(c + 1) % 3];
     for (int k = 0; k < 4; k++)
         for (int c = 0; c < 3; c++)
-            x[3 * k + c] = mid[c] - along * n[c] + size * ((k == 0 || k == 3 ? -1 : 1) * u[c] + (k < 2 ? -1 : 1) * t[c]);
+            x[3 * k + c] = mid[c] - along * n[c] +
+                           size * ((k == 0 || k == 3 ? -1 : 1) * u[c] + (k < 2 ? -1 : 1) * t[c]);
     if (r->s.world.dim == 2) {
         for (int c = 0; c < 3; c++)
-            x[c] = mid[c] - along * n[c] - 2 * size * u[c], x[3 + c] = mid[c] - along * n[c] + 2 * size * u[c];
+            x[c] = mid[c] - along * n[c] - 2 * size * u[c],
+            x[3 + c] = mid[c] - along * n[c] + 2 * size * u[c];
         view_add_segments(r->view, x, 2, line, 1, 0, &style);
     } else {
         view_add_mesh(r->view, x, 4, square, 2, &style);
@@ -535,11 +573,15 @@ static void draw_plane(run *r, const scene_plane *p, const double *lo, const dou
 
 // The box the camera sees: soft bodies, and obstacles and ground as far as they are near them.
 static void scene_box(const run *r, double *lo, double *hi) {
-    double size = 0, at_lo[3] = {INFINITY, INFINITY, INFINITY}, at_hi[3] = {-INFINITY, -INFINITY, -INFINITY};
+    double size = 0, at_lo[3] = {INFINITY, INFINITY, INFINITY},
+           at_hi[3] = {-INFINITY, -INFINITY, -INFINITY};
     for (int c = 0; c < 3; c++) lo[c] = INFINITY, hi[c] = -INFINITY;
     for (int b = 0; b < r->s.bodies; b++)
-        if (!r->s.body[b].obstacle) view_box_add(lo, hi, r->x3 + 3 * (size_t)r->s.body[b].first, r->s.body[b].mesh.nodes);
-        else view_box_add(at_lo, at_hi, r->x3 + 3 * (size_t)r->s.body[b].first, r->s.body[b].mesh.nodes);
+        if (!r->s.body[b].obstacle)
+            view_box_add(lo, hi, r->x3 + 3 * (size_t)r->s.body[b].first, r->s.body[b].mesh.nodes);
+        else
+            view_box_add(at_lo, at_hi, r->x3 + 3 * (size_t)r->s.body[b].first,
+                         r->s.body[b].mesh.nodes);
     for (int c = 0; c < 3; c++) size = fmax(size, hi[c] - lo[c]);
     for (int c = 0; c < 3; c++) {
         double a = lo[c], b = hi[c];
@@ -547,7 +589,8 @@ static void scene_box(const run *r, double *lo, double *hi) {
         if (at_hi[c] > b) hi[c] = fmin(at_hi[c], b + 0.6 * size);
     }
     for (int k = 0; k < r->s.planes; k++)
-        if (level(&r->s.plane[k])) lo[1] = fmax(fmin(lo[1], r->s.plane[k].origin[1]), lo[1] - 2 * size);
+        if (level(&r->s.plane[k]))
+            lo[1] = fmax(fmin(lo[1], r->s.plane[k].origin[1]), lo[1] - 2 * size);
 }
 
 static void place_camera(run *r) {
@@ -562,8 +605,8 @@ static void place_camera(run *r) {
         r->camera = view_camera_fit_2d(lo, hi, r->s.frames.width, r->s.frames.height);
         return;
     }
-    r->camera = view_camera_fit(lo, hi, r->s.camera.azimuth, r->s.camera.elevation, r->s.camera.fov, VIEW_UP_Y,
-                                r->s.frames.width, r->s.frames.height);
+    r->camera = view_camera_fit(lo, hi, r->s.camera.azimuth, r->s.camera.elevation, r->s.camera.fov,
+                                VIEW_UP_Y, r->s.frames.width, r->s.frames.height);
     for (int c = 0; c < 3; c++) d[c] = r->camera.eye[c] - r->camera.at[c], l += d[c] * d[c];
     for (int c = 0; c < 3 && r->s.camera.distance > 0; c++)
         r->camera.eye[c] = r->camera.at[c] + d[c] * r->s.camera.distance / sqrt(l);
@@ -601,8 +644,8 @@ static int draw_frame(run *r) {
     view_label(&im, name ? name + 1 : r->o.scene, line);
     field_range(r, &low, &high);
     if (r->s.frames.field != SCENE_FIELD_NONE)
-        view_colour_bar(&im, r->s.frames.field == SCENE_FIELD_J ? VIEW_MAP_BALANCE : VIEW_MAP_SEA, low, high,
-                        scene__fields[r->s.frames.field]);
+        view_colour_bar(&im, r->s.frames.field == SCENE_FIELD_J ? VIEW_MAP_BALANCE : VIEW_MAP_SEA,
+                        low, high, scene__fields[r->s.frames.field]);
     snprintf(path, sizeof path, "%s/frames/%04d.png", r->o.out, r->step);
     if (!view_write_png(path, &im, &why)) return fail(r, "%s", why.message);
     remember(&r->pictures, &r->picture_times, &r->picture_count, path, tss_world_time(r->w));
@@ -619,18 +662,22 @@ static int build_meshes(run *r) {
         tris += soft && dim == 3 ? 0 : m->triangles;
         edges += soft ? 0 : m->edges, points += soft ? 0 : m->points;
     }
-    if (tss_mesh_alloc(NULL, dim, n, tets, tris, edges, points, &r->all) != TSS_OK) return fail(r, "out of memory");
+    if (tss_mesh_alloc(NULL, dim, n, tets, tris, edges, points, &r->all) != TSS_OK)
+        return fail(r, "out of memory");
     tets = tris = edges = points = 0;
     for (int b = 0; b < r->s.bodies; b++) {
         const tss_mesh *m = &r->s.body[b].mesh;
         int soft = !r->s.body[b].obstacle, first = r->s.body[b].first;
-        for (int k = 0; soft && dim == 3 && k < 4 * m->tets; k++) r->all.tet[4 * tets + k] = first + m->tet[k];
+        for (int k = 0; soft && dim == 3 && k < 4 * m->tets; k++)
+            r->all.tet[4 * tets + k] = first + m->tet[k];
         for (int k = 0; !(soft && dim == 3) && k < 3 * m->triangles; k++)
             r->all.triangle[3 * tris + k] = first + m->triangle[k];
-        for (int k = 0; !soft && k < 2 * m->edges; k++) r->all.edge[2 * edges + k] = first + m->edge[k];
+        for (int k = 0; !soft && k < 2 * m->edges; k++)
+            r->all.edge[2 * edges + k] = first + m->edge[k];
         for (int k = 0; !soft && k < m->points; k++) r->all.point[points + k] = first + m->point[k];
         for (int k = 0; soft && dim == 3 && k < m->tets; k++) r->all.tet_region[tets + k] = b;
-        for (int k = 0; !(soft && dim == 3) && k < m->triangles; k++) r->all.triangle_region[tris + k] = b;
+        for (int k = 0; !(soft && dim == 3) && k < m->triangles; k++)
+            r->all.triangle_region[tris + k] = b;
         tets += soft && dim == 3 ? m->tets : 0;
         tris += soft && dim == 3 ? 0 : m->triangles;
         edges += soft ? 0 : m->edges, points += soft ? 0 : m->points;
@@ -641,9 +688,12 @@ static int build_meshes(run *r) {
 // Surface triangles, sorted by body.
 static int build_skin(run *r) {
     tss_surface f;
-    if (tss_world_surface(r->w, &f) != TSS_OK) return fail(r, "%s: %s", r->o.scene, tss_world_error(r->w));
-    int flat = r->s.world.dim == 2, tris = flat ? r->all.triangles : f.triangles, n = tss_world_nodes(r->w);
-    if (tss_mesh_alloc(NULL, r->s.world.dim, n, 0, tris, flat ? f.edges : r->all.edges, r->all.points, &r->skin) != TSS_OK)
+    if (tss_world_surface(r->w, &f) != TSS_OK)
+        return fail(r, "%s: %s", r->o.scene, tss_world_error(r->w));
+    int flat = r->s.world.dim == 2, tris = flat ? r->all.triangles : f.triangles,
+        n = tss_world_nodes(r->w);
+    if (tss_mesh_alloc(NULL, r->s.world.dim, n, 0, tris, flat ? f.edges : r->all.edges,
+                       r->all.points, &r->skin) != TSS_OK)
         return fail(r, "out of memory");
     r->skin_first = (int *)need((size_t)r->s.bodies + 1, sizeof(int));
     int at = 0;
@@ -656,8 +706,10 @@ static int build_skin(run *r) {
     }
     r->skin_first[r->s.bodies] = at;
     if (flat) memcpy(r->skin.triangle, r->all.triangle, 3 * (size_t)tris * sizeof(int));
-    if (flat) memcpy(r->skin.edge, f.edge, 2 * (size_t)f.edges * sizeof(int));
-    else if (r->all.edges) memcpy(r->skin.edge, r->all.edge, 2 * (size_t)r->all.edges * sizeof(int));
+    if (flat)
+        memcpy(r->skin.edge, f.edge, 2 * (size_t)f.edges * sizeof(int));
+    else if (r->all.edges)
+        memcpy(r->skin.edge, r->all.edge, 2 * (size_t)r->all.edges * sizeof(int));
     if (r->all.points) memcpy(r->skin.point, r->all.point, (size_t)r->all.points * sizeof(int));
     return 1;
 }
@@ -672,13 +724,15 @@ static int write_state(run *r) {
     if (r->vtu && tss_mesh_write_vtu(&r->all, r->x3, path, fields, 1 + field, 0, &why) != TSS_OK)
         return fail(r, "%s: %s", why.file, why.message);
     // Names in the .pvd are relative to it.
-    if (r->vtu) remember(&r->states, &r->state_times, &r->state_count, path + strlen(r->o.out) + 1,
-                         tss_world_time(r->w));
+    if (r->vtu)
+        remember(&r->states, &r->state_times, &r->state_count, path + strlen(r->o.out) + 1,
+                 tss_world_time(r->w));
     snprintf(path, sizeof path, "%s/obj/%04d.obj", r->o.out, r->step);
     if (r->obj && tss_mesh_write_obj(&r->skin, r->x3, path, &why) != TSS_OK)
         return fail(r, "%s: %s", why.file, why.message);
     snprintf(path, sizeof path, "%s/frames.pvd", r->o.out);
-    if (r->vtu && tss_write_pvd(NULL, path, (const char *const *)r->states, r->state_times, r->state_count, &why) != TSS_OK)
+    if (r->vtu && tss_write_pvd(NULL, path, (const char *const *)r->states, r->state_times,
+                                r->state_count, &why) != TSS_OK)
         return fail(r, "%s: %s", why.file, why.message);
     return 1;
 }
@@ -713,8 +767,10 @@ static void write_header(FILE *f) {
 static void write_row(FILE *f, const row *w) {
     for (int k = 0; k < COLUMN_COUNT; k++) {
         if (k) fputc(',', f);
-        if (k == COL_status) fputs(tss_status_text((tss_status)(int)w->v[k]), f);
-        else fprintf(f, "%.10g", w->v[k]);
+        if (k == COL_status)
+            fputs(tss_status_text((tss_status)(int)w->v[k]), f);
+        else
+            fprintf(f, "%.10g", w->v[k]);
     }
     fputc('\n', f);
     fflush(f);
@@ -729,7 +785,9 @@ static int parse_row(char *line, row *w) {
             w->v[k] = 0;
             for (int s = 0; s < TSS_STATUS_COUNT; s++) {
                 const char *text = tss_status_text((tss_status)s);
-                if (strlen(text) == (size_t)(end - line) && strncmp(text, line, (size_t)(end - line)) == 0) w->v[k] = s;
+                if (strlen(text) == (size_t)(end - line) &&
+                    strncmp(text, line, (size_t)(end - line)) == 0)
+                    w->v[k] = s;
             }
         } else {
             w->v[k] = strtod(line, &end);
@@ -764,11 +822,12 @@ static int open_stats(run *r) {
 static void print_bar(const run *r, const tss_step_info *i) {
     char bar[33];
     int steps = r->s.world.steps, done = steps > 0 ? 32 * r->step / steps : 32;
-    double spent = now(NULL) - r->started, left = r->step > 0 ? spent * (steps - r->step) / r->step : 0;
+    double spent = now(NULL) - r->started,
+           left = r->step > 0 ? spent * (steps - r->step) / r->step : 0;
     for (int k = 0; k < 32; k++) bar[k] = k < done ? '#' : '.';
     bar[32] = 0;
-    printf("\r[%s] %d/%d  t %.3f s  newton %d  contacts %d  %.2f s/step  %.0f s left   ", bar, r->step, steps,
-           i->time, i->newton, i->contacts, i->seconds, left);
+    printf("\r[%s] %d/%d  t %.3f s  newton %d  contacts %d  %.2f s/step  %.0f s left   ", bar,
+           r->step, steps, i->time, i->newton, i->contacts, i->seconds, left);
     if (r->step == steps) printf("\n");
     fflush(stdout);
 }
@@ -784,13 +843,16 @@ static void record(run *r, const tss_step_info *i) {
     keep_row(r, &w);
     write_row(r->csv, &w);
     if (i->status != TSS_STEP_CONVERGED && r->failed++ == 0)
-        snprintf(r->worst, sizeof r->worst, "step %d (%s): %s", r->step, tss_status_text(i->status), i->message);
+        snprintf(r->worst, sizeof r->worst, "step %d (%s): %s", r->step, tss_status_text(i->status),
+                 i->message);
     if (r->terminal) {
         print_bar(r, i);
         return;
     }
-    printf("step %d t %.4f %s newton %d contacts %d residual %.3g min_J %.3g distance %.3g %.3f s\n", r->step, i->time,
-           tss_status_text(i->status), i->newton, i->contacts, i->residual_max, i->min_J, i->min_distance, i->seconds);
+    printf(
+        "step %d t %.4f %s newton %d contacts %d residual %.3g min_J %.3g distance %.3g %.3f s\n",
+        r->step, i->time, tss_status_text(i->status), i->newton, i->contacts, i->residual_max,
+        i->min_J, i->min_distance, i->seconds);
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -821,7 +883,8 @@ static int write_checkpoint(run *r) {
     ok = f && fwrite(&c, sizeof c, 1, f) == 1 && fwrite(data, 1, total, f) == total;
     if (f) ok = fclose(f) == 0 && ok;
     free(data);
-    if (!ok || rename(part, path) != 0) return fail(r, "%s: cannot be written: %s", path, strerror(errno));
+    if (!ok || rename(part, path) != 0)
+        return fail(r, "%s: cannot be written: %s", path, strerror(errno));
     return 1;
 }
 
@@ -829,16 +892,19 @@ static int read_checkpoint(run *r) {
     checkpoint c;
     FILE *f = fopen(r->o.resume, "rb");
     if (!f) return fail(r, "%s: cannot be read: %s", r->o.resume, strerror(errno));
-    int ok = fread(&c, sizeof c, 1, f) == 1 && memcmp(c.magic, checkpoint_magic, sizeof c.magic) == 0 &&
+    int ok = fread(&c, sizeof c, 1, f) == 1 &&
+             memcmp(c.magic, checkpoint_magic, sizeof c.magic) == 0 &&
              c.scene_bytes == scene_state(&r->s, NULL, 0, 0) && c.world_bytes < ((uint64_t)1 << 40);
     char *data = ok ? (char *)need(c.scene_bytes + c.world_bytes, 1) : NULL;
     ok = ok && fread(data, 1, c.scene_bytes + c.world_bytes, f) == c.scene_bytes + c.world_bytes;
     fclose(f);
     ok = ok && scene_state(&r->s, data, c.scene_bytes, 0) > 0;
-    tss_result e = ok ? tss_world_load(r->w, data + c.scene_bytes, c.world_bytes) : TSS_ERROR_MISMATCH;
+    tss_result e =
+        ok ? tss_world_load(r->w, data + c.scene_bytes, c.world_bytes) : TSS_ERROR_MISMATCH;
     free(data);
     if (e != TSS_OK)
-        return fail(r, "%s: %s (expected a checkpoint of this scene)", r->o.resume, tss_result_text(e));
+        return fail(r, "%s: %s (expected a checkpoint of this scene)", r->o.resume,
+                    tss_result_text(e));
     r->step = (int)c.step;
     return 1;
 }
@@ -866,10 +932,12 @@ static void print_summary(const run *r) {
     totals(r, COL_seconds, &s, &s_max);
     totals(r, COL_newton, &n, &n_max);
     totals(r, COL_residual_max, &res, &res_max);
-    printf("%d steps, %d converged; %.3f s a step (worst %.3f); %.1f Newton iterates a step (worst %.0f)\n",
-           r->row_count, r->row_count - r->failed, s, s_max, n, n_max);
-    printf("worst residual %.3g m/s, least J %.4g, least distance %.3g m\n", res_max, smallest(r, COL_min_J),
-           smallest(r, COL_min_distance));
+    printf(
+        "%d steps, %d converged; %.3f s a step (worst %.3f); %.1f Newton iterates a step (worst "
+        "%.0f)\n",
+        r->row_count, r->row_count - r->failed, s, s_max, n, n_max);
+    printf("worst residual %.3g m/s, least J %.4g, least distance %.3g m\n", res_max,
+           smallest(r, COL_min_J), smallest(r, COL_min_distance));
     if (r->failed) printf("not converged: %s\n", r->worst);
     printf("state %016llx\n", (unsigned long long)tss_world_hash(r->w));
 }
@@ -895,9 +963,11 @@ static void plot(report *p, const run *r, report_plot look, const column *which,
 }
 
 static void report_plots(report *p, const run *r) {
-    static const column work[] = {COL_newton}, touch[] = {COL_contacts}, error[] = {COL_residual_max, COL_residual_mean},
-        gap[] = {COL_min_distance}, J[] = {COL_min_J},
-        phase[] = {COL_energy_s, COL_gradient_s, COL_hessian_s, COL_assemble_s, COL_linear_s, COL_collision_s, COL_other_s};
+    static const column work[] = {COL_newton}, touch[] = {COL_contacts},
+                        error[] = {COL_residual_max, COL_residual_mean}, gap[] = {COL_min_distance},
+                        J[] = {COL_min_J},
+                        phase[] = {COL_energy_s, COL_gradient_s,  COL_hessian_s, COL_assemble_s,
+                                   COL_linear_s, COL_collision_s, COL_other_s};
     report_plot a = report_plot_default("Newton iterates", "time, s", "iterates a step");
     a.zero = 1;
     plot(p, r, a, work, 1);
@@ -917,13 +987,14 @@ static void report_plots(report *p, const run *r) {
 }
 
 static void report_scene(report *p, const run *r) {
-    static const char *const names[] = {"bodies", "nodes", "cells", "surface triangles", "step, s", "integrator",
-                                        "threads", "state"};
+    static const char *const names[] = {"bodies",  "nodes",      "cells",   "surface triangles",
+                                        "step, s", "integrator", "threads", "state"};
     char text[8][60];
     const char *values[8];
     int obstacles = 0;
     for (int b = 0; b < r->s.bodies; b++) obstacles += r->s.body[b].obstacle;
-    snprintf(text[0], 60, "%d soft, %d obstacles, %d planes", r->s.bodies - obstacles, obstacles, r->s.planes);
+    snprintf(text[0], 60, "%d soft, %d obstacles, %d planes", r->s.bodies - obstacles, obstacles,
+             r->s.planes);
     snprintf(text[1], 60, "%d", tss_world_nodes(r->w));
     snprintf(text[2], 60, "%d", r->s.world.dim == 3 ? r->all.tets : r->all.triangles);
     snprintf(text[3], 60, "%d", r->skin.triangles);
@@ -949,7 +1020,9 @@ static int write_report(run *r, int judged, int sound) {
     report_status(p, "A step takes", text, REPORT_INFO);
     snprintf(text, sizeof text, "%.1f, worst %.0f", n, n_max);
     report_status(p, "Newton iterates a step", text, REPORT_INFO);
-    if (judged) report_status(p, "Independent judge", sound ? "no violation" : "violations", sound ? REPORT_GOOD : REPORT_BAD);
+    if (judged)
+        report_status(p, "Independent judge", sound ? "no violation" : "violations",
+                      sound ? REPORT_GOOD : REPORT_BAD);
     report_frames(p, (const char *const *)r->pictures, NULL, r->picture_count, 8);
     if (r->row_count > 0) report_plots(p, r);
     report_scene(p, r);
@@ -978,7 +1051,8 @@ static int build_world(run *r) {
     tss_host host = tss_host_default();
     host.clock = now, host.log = print_log, host.workers = r->o.threads;
 #ifdef _OPENMP
-    if (r->o.threads > 0) omp_set_num_threads(r->o.threads);  // pictures and the judge use OpenMP themselves
+    if (r->o.threads > 0)
+        omp_set_num_threads(r->o.threads);  // pictures and the judge use OpenMP themselves
 #endif
     if (!scene_build(&r->s, &host, judge_iterate, r, &r->w, &r->ipc, &r->why)) return 0;
     r->o.threads = tss_workers(&host);
@@ -988,10 +1062,13 @@ static int build_world(run *r) {
 static int take_step(run *r, tss_step_info *info) {
     if (!scene_drive(&r->s, r->w, &r->why)) return 0;
     mark_kinematic(r);
-    tss_result e = r->s.run.budget_ms > 0 ? tss_world_step_for(r->w, 1e-3 * r->s.run.budget_ms, info)
-                                          : tss_world_step(r->w, info);
-    return e == TSS_OK ? 1 : fail(r, "%s: step %d: %s", r->o.scene, r->step + 1,
-                                  tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e));
+    tss_result e = r->s.run.budget_ms > 0
+                       ? tss_world_step_for(r->w, 1e-3 * r->s.run.budget_ms, info)
+                       : tss_world_step(r->w, info);
+    return e == TSS_OK
+               ? 1
+               : fail(r, "%s: step %d: %s", r->o.scene, r->step + 1,
+                      tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e));
 }
 
 static int take_steps(run *r) {
@@ -1014,7 +1091,8 @@ static void run_free(run *r) {
     for (int k = 0; k < r->picture_count; k++) free(r->pictures[k]);
     for (int k = 0; k < r->state_count; k++) free(r->states[k]);
     free(r->pictures), free(r->states), free(r->picture_times), free(r->state_times), free(r->rows);
-    free(r->x3), free(r->field), free(r->kinematic), free(r->node_body), free(r->skin_first), free(r->halfspaces);
+    free(r->x3), free(r->field), free(r->kinematic), free(r->node_body), free(r->skin_first),
+        free(r->halfspaces);
     tss_mesh_free(&r->all);
     tss_mesh_free(&r->skin);
     view_destroy(r->view);
@@ -1062,19 +1140,26 @@ static int command_check(run *r) {
     tss_result e;
     if (!read_scene(r) || !build_world(r)) return 1;
     if ((e = tss_world_check(r->w, &c)) != TSS_OK)
-        return fail(r, "%s: %s", r->o.scene, tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e)), 1;
-    for (int k = 0; k < c.count; k++) printf("%s: %s: %s\n", r->o.scene, words[c.issue[k].severity], c.issue[k].text);
-    if (c.errors + c.warnings + c.notes > c.count) printf("... and %d more\n", c.errors + c.warnings + c.notes - c.count);
-    printf("%s: %d bodies, %d nodes, %d steps of %g s: %d errors, %d warnings\n", r->o.scene, r->s.bodies,
-           tss_world_nodes(r->w), r->s.world.steps, r->s.world.dt, c.errors, c.warnings);
+        return fail(r, "%s: %s", r->o.scene,
+                    tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e)),
+               1;
+    for (int k = 0; k < c.count; k++)
+        printf("%s: %s: %s\n", r->o.scene, words[c.issue[k].severity], c.issue[k].text);
+    if (c.errors + c.warnings + c.notes > c.count)
+        printf("... and %d more\n", c.errors + c.warnings + c.notes - c.count);
+    printf("%s: %d bodies, %d nodes, %d steps of %g s: %d errors, %d warnings\n", r->o.scene,
+           r->s.bodies, tss_world_nodes(r->w), r->s.world.steps, r->s.world.dt, c.errors,
+           c.warnings);
     return c.errors > 0;
 }
 
 int main(int argc, char **argv) {
     static run r;
     if (argc >= 2 && strcmp(argv[1], "--version") == 0) return version();
-    if (argc >= 2 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0)) return usage(stdout);
-    if (argc < 2 || (strcmp(argv[1], "run") != 0 && strcmp(argv[1], "check") != 0)) return usage(stderr);
+    if (argc >= 2 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0))
+        return usage(stdout);
+    if (argc < 2 || (strcmp(argv[1], "run") != 0 && strcmp(argv[1], "check") != 0))
+        return usage(stderr);
     if (!read_options(argc, argv, &r.o)) return 2;
     int code = strcmp(r.o.command, "run") == 0 ? command_run(&r) : command_check(&r);
     if (r.why.text[0]) fprintf(stderr, "tss: %s\n", r.why.text);

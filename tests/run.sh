@@ -4,6 +4,7 @@
 #   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|unit   one part
 # Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
 set -u
+export OMP_WAIT_POLICY=passive  # tests may share the machine: threads that wait shall not spin
 build=$1
 part=${2:-all}
 cc=${CC:-cc}
