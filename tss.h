@@ -36,6 +36,7 @@
  *     TSS_NO_LAPACK  accepted and without effect: the dense kernels are built in. Debian's serial
  *                    OpenBLAS returned wrong products when called from several threads at once,
  *                    and a threaded BLAS changes bits with the number of threads.
+ *     TSS_ALLOW_FAST_MATH  compile under -ffast-math all the same; nothing is promised then.
  *     TSS_ASSERT(c)  what to do about a caller's bug; default assert.
  *     TSS_API        linkage of public functions; default extern.
  *
@@ -247,6 +248,9 @@ typedef struct tss_energy_def {
     void (*destroy)(void *user, const tss_host *host);
     int cookie;
 } tss_energy_def;
+
+// All zero but for the cookie: start from it.
+TSS_API tss_energy_def tss_energy_def_default(void);
 
 #define TSS_BATCH 64  // most stencils in one batch call; multiples of 8 start at multiples of 8
 
@@ -573,6 +577,8 @@ TSS_API tss_result tss_world_create(const tss_world_def *def, tss_world **out);
 TSS_API void tss_world_destroy(tss_world *w);
 // One sentence about the last call that failed on this world: names body, node, element, value.
 TSS_API const char *tss_world_error(const tss_world *w);
+// For extensions: sets that sentence (printf format), logs it and returns r.
+TSS_API tss_result tss_world_fail(tss_world *w, tss_result r, const char *format, ...);
 
 // ---------------------------------------------------------------------------------------------
 // >>bodies (public)
@@ -671,7 +677,7 @@ TSS_API tss_result tss_world_set_tol(tss_world *w, double tol);  // m/s, > 0
     X(TSS_STEP_ITERATIONS, "iterations")  /* max_iterations reached */                            \
     X(TSS_STEP_BUDGET, "budget")          /* the time given to step_for ran out */                \
     X(TSS_STEP_STALLED, "stalled")        /* no feasible descent along the Newton direction */    \
-    X(TSS_STEP_TARGETS, "targets")        /* scripted nodes could not reach their targets */      \
+    X(TSS_STEP_TARGETS, "targets")        /* max_iterations reached, scripted nodes on their way */      \
     X(TSS_STEP_LINEAR, "linear")          /* the linear solver failed */
 typedef enum tss_status {
 #define TSS__ENUM(id, text) id,
@@ -712,8 +718,8 @@ typedef struct tss_step_info {
 // Partition, masses, symbolic work; then steps may be taken. Errors: EMPTY, NO_MEMORY and those of
 // the energies. Cheap when nothing changed.
 TSS_API tss_result tss_world_prepare(tss_world *w);
-// One time step of length dt, to tolerance. A numerical failure is a status, not an error: the
-// state then is the last accepted iterate, always feasible. info may be NULL. On an error the
+// One time step of length dt, to tolerance. A numerical failure is a status, not an error: time
+// goes on and the state is the last accepted iterate, always feasible. info may be NULL. On an error the
 // state is that before the call.
 TSS_API tss_result tss_world_step(tss_world *w, tss_step_info *info);
 // The same, but returns after about `seconds` (host.clock is needed) with the best state so far.
@@ -730,7 +736,8 @@ TSS_API const double *tss_world_velocities(const tss_world *w);  // n × dim
 TSS_API const double *tss_world_rest(const tss_world *w);        // X, n × dim
 TSS_API const double *tss_world_masses(const tss_world *w);      // n
 TSS_API const uint8_t *tss_world_kinds(const tss_world *w);      // tss_node_kind, n
-// ∇E/αh² of all energies but inertia at the current state: minus the net force, n × dim, N.
+// Sum of the gradients of all energies that are forces at the current state, n × dim, N: minus
+// what elasticity, contact and your own energies do. Gravity and nodal forces are not in it.
 TSS_API tss_result tss_world_gradient(tss_world *w, double *out);
 // Total energy by kind, J: kinetic, potential of all energies that are forces, gravity excluded.
 TSS_API tss_result tss_world_energy(tss_world *w, double *kinetic, double *potential);
@@ -757,7 +764,6 @@ typedef struct tss_check_report {
 TSS_API tss_result tss_world_check(tss_world *w, tss_check_report *out);
 
 // Adds an energy (see the hook above). user must live until destroy is called.
-TSS_API tss_energy_def tss_energy_def_default(void);
 TSS_API tss_result tss_energy_add(tss_world *w, const tss_energy_def *def, tss_energy *out);
 TSS_API tss_result tss_energy_remove(tss_world *w, tss_energy e);
 
@@ -791,6 +797,10 @@ TSS_API void tss_embedding_update(const tss_embedding *e, const tss_world *w, fl
 
 #if defined(TSS_IMPLEMENTATION) && !defined(TSS_IMPLEMENTATION_DONE)
 #define TSS_IMPLEMENTATION_DONE
+
+#if defined(__FAST_MATH__) && !defined(TSS_ALLOW_FAST_MATH)
+#error "-ffast-math breaks infinities, the order of sums and collision bounds; TSS_ALLOW_FAST_MATH to try"
+#endif
 
 #include <math.h>
 #include <stdarg.h>
@@ -2707,8 +2717,7 @@ static int tss__elastic_has_barrier(const tss__elastic *e) {
 
 // The hook; the energy takes e over (destroy frees it).
 static tss_energy_def tss__elastic_def(tss__elastic *e) {
-    tss_energy_def d;
-    memset(&d, 0, sizeof d);
+    tss_energy_def d = tss_energy_def_default();
     d.name = "elasticity";
     d.arity = e->dim + 1;
     d.flags = TSS_ENERGY_TIMES_AH2 | TSS_ENERGY_SECANT_OK;
@@ -2940,7 +2949,7 @@ static tss_result tss__damping_create(const tss_host *host, tss__elastic *e, tss
         return TSS_ERROR_NO_MEMORY;
     }
     memset(m->frozen, 0, (size_t)e->blocks * sizeof *m->frozen);
-    memset(out, 0, sizeof *out);
+    *out = tss_energy_def_default();
     out->name = "damping";
     out->arity = e->dim + 1;
     out->flags = TSS_ENERGY_TIMES_AH2 | TSS_ENERGY_SECANT_OK;
@@ -3220,8 +3229,7 @@ static tss__membrane *tss__membrane_alloc(const tss_host *host, const tss_membra
 
 // An energy of forces: times αh², the pattern fixed.
 static tss_energy_def tss__thin_energy(const char *name, int arity, void *user) {
-    tss_energy_def d;
-    memset(&d, 0, sizeof d);
+    tss_energy_def d = tss_energy_def_default();
     d.name = name, d.arity = arity, d.user = user, d.flags = TSS_ENERGY_TIMES_AH2;
     return d;
 }
@@ -6717,7 +6725,7 @@ struct tss_world {
 #define TSS__BODY(w, b) (&((tss__bodydata *)(w)->bodies.p)[b])
 #define TSS__ENTRY(w, e) (&((tss__entry *)(w)->entries.p)[e])
 
-static tss_result tss__fail(tss_world *w, tss_result r, const char *format, ...) {
+tss_result tss_world_fail(tss_world *w, tss_result r, const char *format, ...) {
     va_list args;
     va_start(args, format);
     vsnprintf(w->error, sizeof w->error, format, args);
@@ -6727,7 +6735,7 @@ static tss_result tss__fail(tss_world *w, tss_result r, const char *format, ...)
 }
 
 static tss_result tss__no_memory(tss_world *w) {
-    return tss__fail(w, TSS_ERROR_NO_MEMORY, "out of memory (%zu bytes in use)", w->bytes);
+    return tss_world_fail(w, TSS_ERROR_NO_MEMORY, "out of memory (%zu bytes in use)", w->bytes);
 }
 
 // How a solve ended, and why.
@@ -7094,7 +7102,7 @@ static tss_result tss__pattern_build(tss_world *w, tss__matrix *m, int dynamic) 
     ptr[0] = 0;
     for (size_t r = 0; r < rows; r++) ptr[r + 1] = ptr[r] + cursor[r];
     size_t blocks = (size_t)ptr[rows], dd = (size_t)(w->dim * w->dim);
-    if (blocks > INT32_MAX) return tss__fail(w, TSS_ERROR_NO_MEMORY, "matrix of %zu blocks", blocks);
+    if (blocks > INT32_MAX) return tss_world_fail(w, TSS_ERROR_NO_MEMORY, "matrix of %zu blocks", blocks);
     int *col = (int *)tss__need(&w->host, &m->col, blocks, sizeof(int));
     double *val = (double *)tss__need(&w->host, &m->val, blocks * dd, sizeof(double));
     if (!col || !val) return tss__no_memory(w);
@@ -7246,16 +7254,16 @@ static double tss__triangle_area(const double *a, const double *b, const double 
 static tss_result tss__check_nodes(tss_world *w, const char *body, const char *what, int count,
                                    int size, const int *list, int nodes) {
     if (count < 0 || (count > 0 && !list))
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: %d %ss but no array of them", body, count, what);
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: %d %ss but no array of them", body, count, what);
     for (int k = 0; k < count; k++)
         for (int i = 0; i < size; i++) {
             int n = list[k * size + i];
             if (n < 0 || n >= nodes)
-                return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: %s %d names node %d, expected 0..%d",
+                return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: %s %d names node %d, expected 0..%d",
                                  body, what, k, n, nodes - 1);
             for (int j = 0; j < i; j++)
                 if (list[k * size + j] == n)
-                    return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: %s %d names node %d twice", body,
+                    return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: %s %d names node %d twice", body,
                                      what, k, n);
         }
     return TSS_OK;
@@ -7265,7 +7273,7 @@ static tss_result tss__check_finite(tss_world *w, const char *body, const char *
                                     const double *a, int nodes) {
     for (int i = 0; a && i < nodes * w->dim; i++)
         if (!isfinite(a[i]))
-            return tss__fail(w, TSS_ERROR_BAD_STATE, "%s: %s of node %d is %g, expected a finite number",
+            return tss_world_fail(w, TSS_ERROR_BAD_STATE, "%s: %s of node %d is %g, expected a finite number",
                              body, what, i / w->dim, a[i]);
     return TSS_OK;
 }
@@ -7275,12 +7283,12 @@ static tss_result tss__check_material(tss_world *w, const char *body, int cell, 
     char where[80];
     snprintf(where, sizeof where, cell < 0 ? "%s" : "%s, cell %d", body, cell);
     if (!(E > 0) || !isfinite(E))
-        return tss__fail(w, TSS_ERROR_BAD_MATERIAL, "%s: E = %g Pa, expected a positive number", where, E);
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: E = %g Pa, expected a positive number", where, E);
     if (!(nu > -1 && nu < 0.5))
-        return tss__fail(w, TSS_ERROR_BAD_MATERIAL,
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL,
                          "%s: nu = %g, expected -1 < nu < 0.5 (0.49 is nearly incompressible)", where, nu);
     if (!(rho > 0) || !isfinite(rho))
-        return tss__fail(w, TSS_ERROR_BAD_MATERIAL, "%s: rho = %g kg/m^3, expected a positive number",
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: rho = %g kg/m^3, expected a positive number",
                          where, rho);
     return TSS_OK;
 }
@@ -7313,9 +7321,9 @@ static tss_result tss__check_volumes(tss_world *w, const char *body, const tss_b
             }
         double flat = 1e-12 * (dim == 3 ? longest * longest * longest : longest * longest);
         if (fabs(vol) <= flat)
-            return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: cell %d is degenerate (volume %g)", body, c, vol);
+            return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: cell %d is degenerate (volume %g)", body, c, vol);
         if (vol < 0)
-            return tss__fail(w, TSS_ERROR_BAD_MESH,
+            return tss_world_fail(w, TSS_ERROR_BAD_MESH,
                              "%s: cell %d is inverted (volume %g); swap two of its nodes", body, c, vol);
     }
     return TSS_OK;
@@ -7331,7 +7339,7 @@ static tss_result tss__check_referenced(tss_world *w, const char *body, const ts
     for (int k = 0; k < d->points; k++) used[d->point[k]] = 1;
     for (int i = 0; i < d->nodes; i++)
         if (!used[i])
-            return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: node %d belongs to no cell, face or segment",
+            return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: node %d belongs to no cell, face or segment",
                              body, i);
     return TSS_OK;
 }
@@ -7339,15 +7347,15 @@ static tss_result tss__check_referenced(tss_world *w, const char *body, const ts
 static tss_result tss__check_body(tss_world *w, const char *name, const tss_body_def *d) {
     tss_result r;
     if (d->cookie != TSS__COOKIE)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: start from tss_body_def_default()", name);
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: start from tss_body_def_default()", name);
     if (d->nodes <= 0 || !d->X)
-        return tss__fail(w, TSS_ERROR_EMPTY, "%s: has no nodes", name);
+        return tss_world_fail(w, TSS_ERROR_EMPTY, "%s: has no nodes", name);
     if (d->nodes > INT32_MAX / 16 - w->n)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: %d nodes are too many", name, d->nodes);
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: %d nodes are too many", name, d->nodes);
     if (d->kind == TSS_BODY_SOFT && d->cells == 0 && !(w->dim == 3 && d->triangles > 0))
-        return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: a soft body needs cells (or triangles: a shell)", name);
+        return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: a soft body needs cells (or triangles: a shell)", name);
     if (d->kind == TSS_BODY_OBSTACLE && d->cells > 0)
-        return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: an obstacle has a surface, not cells", name);
+        return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: an obstacle has a surface, not cells", name);
     if ((r = tss__check_finite(w, name, "rest position", d->X, d->nodes)) != TSS_OK) return r;
     if ((r = tss__check_finite(w, name, "position", d->x0, d->nodes)) != TSS_OK) return r;
     if ((r = tss__check_finite(w, name, "velocity", d->v0, d->nodes)) != TSS_OK) return r;
@@ -7360,10 +7368,10 @@ static tss_result tss__check_body(tss_world *w, const char *name, const tss_body
     if ((r = tss__check_nodes(w, name, "point", d->points, 1, d->point, d->nodes)) != TSS_OK) return r;
     if ((r = tss__check_nodes(w, name, "pin", d->pins, 1, d->pin, d->nodes)) != TSS_OK) return r;
     if (w->dim == 2 && d->triangles > 0)
-        return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: in 2D, triangles are cells and surfaces segments", name);
+        return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: in 2D, triangles are cells and surfaces segments", name);
     double damping = d->material.damping;
     if (!(damping >= 0) || !isfinite(damping))
-        return tss__fail(w, TSS_ERROR_BAD_MATERIAL, "%s: damping = %g s, expected >= 0", name, damping);
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: damping = %g s, expected >= 0", name, damping);
     if ((r = tss__check_volumes(w, name, d)) != TSS_OK) return r;
     if (d->kind == TSS_BODY_SOFT && (r = tss__check_materials(w, name, d)) != TSS_OK) return r;
     return tss__check_referenced(w, name, d);
@@ -7398,7 +7406,7 @@ static tss_result tss__boundary(tss_world *w, const char *name, const tss__facet
     for (size_t k = 0, next; k < count; k = next) {
         for (next = k + 1; next < count && tss__facet_same(&f[k], &f[next]);) next++;
         if (next - k > 2)
-            return tss__fail(w, TSS_ERROR_BAD_MESH, "%s: nodes %d %d %d are a face of %zu cells, expected 1 or 2",
+            return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: nodes %d %d %d are a face of %zu cells, expected 1 or 2",
                              name, f[k].key[0], f[k].key[1], f[k].key[2], next - k);
         if (next - k == 1)
             for (int i = 0; i < size; i++) to[m++] = f[k].node[i];
@@ -7462,7 +7470,7 @@ static tss_result tss__check_duplicates(tss_world *w, const char *name, const ts
     for (size_t k = 0; r == TSS_OK && k < count; k++)
         for (size_t j = k + 1; j < count && tss__facet_same(&f[j], &f[k]); j++)
             if (f[j].node[0] == f[k].node[0])
-                r = tss__fail(w, TSS_ERROR_BAD_MESH, "%s: cells %d and %d have the same nodes", name,
+                r = tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: cells %d and %d have the same nodes", name,
                               f[k].node[1], f[j].node[1]);
     tss__buf_free(&w->host, &all);
     return r;
@@ -7632,7 +7640,7 @@ static int tss__has_body(const tss_world *w, tss_body b) {
 
 tss_result tss_body_remove(tss_world *w, tss_body id) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
-    if (!tss__has_body(w, id)) return tss__fail(w, TSS_ERROR_NOT_FOUND, "no body %d", id);
+    if (!tss__has_body(w, id)) return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no body %d", id);
     tss__bodydata *b = TSS__BODY(w, id);
     b->removed = 1;
     b->cells = b->triangles = b->edges = b->points = 0;
@@ -7670,14 +7678,14 @@ const int *tss_body_cells(const tss_world *w, tss_body b) {
 static tss_result tss__has_node(tss_world *w, int node) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
     if (node < 0 || node >= w->n)
-        return tss__fail(w, TSS_ERROR_NOT_FOUND, "no node %d, expected 0..%d", node, w->n - 1);
+        return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no node %d, expected 0..%d", node, w->n - 1);
     return TSS_OK;
 }
 
 static tss_result tss__finite(tss_world *w, const char *what, const double *a, int count) {
     for (int k = 0; k < count; k++)
         if (!isfinite(a[k]))
-            return tss__fail(w, TSS_ERROR_BAD_STATE, "%s: component %d is %g, expected a finite number",
+            return tss_world_fail(w, TSS_ERROR_BAD_STATE, "%s: component %d is %g, expected a finite number",
                              what, k, a[k]);
     return TSS_OK;
 }
@@ -7694,7 +7702,7 @@ tss_result tss_node_pin(tss_world *w, int node, unsigned axes) {
     if (r != TSS_OK) return r;
     unsigned all = w->dim == 3 ? 7u : 3u;
     if (TSS__BODY(w, tss__i32(&w->body)[node])->kind == TSS_BODY_OBSTACLE)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d belongs to an obstacle", node);
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d belongs to an obstacle", node);
     axes &= all;
     tss__set_kind(w, node, axes == all ? TSS_NODE_PINNED : TSS_NODE_FREE,
                   (uint8_t)(axes == all ? 0 : axes));
@@ -7707,7 +7715,7 @@ tss_result tss_node_pin(tss_world *w, int node, unsigned axes) {
 
 tss_result tss_node_target(tss_world *w, int node, const double *target) {
     tss_result r = tss__has_node(w, node);
-    if (r == TSS_OK && !target) r = tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d: target is NULL", node);
+    if (r == TSS_OK && !target) r = tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d: target is NULL", node);
     if (r == TSS_OK) r = tss__finite(w, "target", target, w->dim);
     if (r != TSS_OK) return r;
     if (tss__u8(&w->kind)[node] != TSS_NODE_OBSTACLE) tss__set_kind(w, node, TSS_NODE_SCRIPTED, 0);
@@ -7717,7 +7725,7 @@ tss_result tss_node_target(tss_world *w, int node, const double *target) {
 
 tss_result tss_body_target(tss_world *w, tss_body id, const double *x) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
-    if (!tss__has_body(w, id)) return tss__fail(w, TSS_ERROR_NOT_FOUND, "no body %d", id);
+    if (!tss__has_body(w, id)) return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no body %d", id);
     const tss__bodydata *b = TSS__BODY(w, id);
     size_t at = (size_t)(b->first * w->dim), len = (size_t)(b->nodes * w->dim);
     tss_result r = x ? tss__finite(w, b->name, x, (int)len) : TSS_OK;
@@ -7730,27 +7738,32 @@ tss_result tss_body_target(tss_world *w, tss_body id, const double *x) {
 
 tss_result tss_node_force(tss_world *w, int node, const double *force) {
     tss_result r = tss__has_node(w, node);
-    if (r == TSS_OK && !force) r = tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d: force is NULL", node);
+    if (r == TSS_OK && !force) r = tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d: force is NULL", node);
     if (r == TSS_OK) r = tss__finite(w, "force", force, w->dim);
     if (r != TSS_OK) return r;
     memcpy(tss__f64(&w->force) + node * w->dim, force, (size_t)w->dim * sizeof(double));
     return TSS_OK;
 }
 
+static tss_result tss__drags_reserve(tss_world *w, size_t n) {
+    if (!tss__need(&w->host, &w->drag_node, n, sizeof(int)) ||
+        !tss__need(&w->host, &w->drag_at, n * (size_t)w->dim, sizeof(double)) ||
+        !tss__need(&w->host, &w->drag_k, n, sizeof(double)))
+        return tss__no_memory(w);
+    return TSS_OK;
+}
+
 tss_result tss_node_drag(tss_world *w, int node, const double *target, double stiffness) {
     tss_result r = tss__has_node(w, node);
     if (r == TSS_OK && (!target || !(stiffness >= 0) || !isfinite(stiffness)))
-        r = tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "drag of node %d: stiffness %g N/m, expected >= 0 and a target",
+        r = tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "drag of node %d: stiffness %g N/m, expected >= 0 and a target",
                       node, stiffness);
     if (r == TSS_OK) r = tss__finite(w, "drag target", target, w->dim);
     if (r != TSS_OK) return r;
     int k = 0;
     while (k < w->drags && tss__i32(&w->drag_node)[k] != node) k++;
     if (stiffness == 0 && k == w->drags) return TSS_OK;
-    if (!tss__need(&w->host, &w->drag_node, (size_t)k + 1, sizeof(int)) ||
-        !tss__need(&w->host, &w->drag_at, (size_t)(k + 1) * (size_t)w->dim, sizeof(double)) ||
-        !tss__need(&w->host, &w->drag_k, (size_t)k + 1, sizeof(double)))
-        return tss__no_memory(w);
+    if ((r = tss__drags_reserve(w, (size_t)k + 1)) != TSS_OK) return r;
     if (k == w->drags) w->drags++, w->drag_pattern++;
     tss__i32(&w->drag_node)[k] = node;
     tss__f64(&w->drag_k)[k] = stiffness;
@@ -7768,10 +7781,10 @@ tss_result tss_node_drag(tss_world *w, int node, const double *target, double st
 
 tss_result tss_body_teleport(tss_world *w, tss_body id, const double *x, const double *v) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
-    if (!tss__has_body(w, id)) return tss__fail(w, TSS_ERROR_NOT_FOUND, "no body %d", id);
+    if (!tss__has_body(w, id)) return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no body %d", id);
     const tss__bodydata *b = TSS__BODY(w, id);
     size_t at = (size_t)(b->first * w->dim), len = (size_t)(b->nodes * w->dim);
-    if (!x) return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: no positions", b->name);
+    if (!x) return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: no positions", b->name);
     tss_result r = tss__finite(w, b->name, x, (int)len);
     if (r == TSS_OK && v) r = tss__finite(w, b->name, v, (int)len);
     if (r != TSS_OK) return r;
@@ -7792,7 +7805,7 @@ tss_result tss_world_set_gravity(tss_world *w, const double *gravity) {
 tss_result tss_world_set_dt(tss_world *w, double dt) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
     if (!(dt > 0) || !isfinite(dt))
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "dt = %g s, expected a positive number", dt);
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "dt = %g s, expected a positive number", dt);
     if (dt != w->def.dt) w->history = 0;
     w->def.dt = dt;
     return TSS_OK;
@@ -7800,7 +7813,7 @@ tss_result tss_world_set_dt(tss_world *w, double dt) {
 
 tss_result tss_world_set_tol(tss_world *w, double tol) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
-    if (!(tol > 0)) return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "tol = %g m/s, expected > 0", tol);
+    if (!(tol > 0)) return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "tol = %g m/s, expected > 0", tol);
     w->def.tol = tol;
     return TSS_OK;
 }
@@ -7929,12 +7942,12 @@ tss_result tss_energy_add(tss_world *w, const tss_energy_def *d, tss_energy *out
     if (out) *out = -1;
     const char *name = d->cookie == TSS__COOKIE && d->name ? d->name : "energy";
     if (d->cookie != TSS__COOKIE)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "energy: start from tss_energy_def_default()");
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "energy: start from tss_energy_def_default()");
     if (d->arity < 1 || d->arity > TSS__MAX_ARITY)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: arity %d, expected 1..%d", name, d->arity,
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "%s: arity %d, expected 1..%d", name, d->arity,
                          TSS__MAX_ARITY);
     if (!d->lists || !d->value || !d->gradient || !d->hessian)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT,
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT,
                          "%s: lists, value, gradient and hessian are required", name);
     int id = w->entry_count;
     for (int k = 0; k < w->entry_count; k++)  // places of replaced internal energies are used again
@@ -7958,7 +7971,7 @@ tss_result tss_energy_add(tss_world *w, const tss_energy_def *d, tss_energy *out
 tss_result tss_energy_remove(tss_world *w, tss_energy id) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
     if (id < 0 || id >= w->entry_count || !TSS__ENTRY(w, id)->live)
-        return tss__fail(w, TSS_ERROR_NOT_FOUND, "no energy %d", id);
+        return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no energy %d", id);
     tss__entry *e = TSS__ENTRY(w, id);
     if (e->def.destroy) e->def.destroy(e->def.user, &w->host);
     e->live = 0;
@@ -8100,12 +8113,11 @@ static tss_result tss__elastic_make(tss_world *w, const tss__bodydata *lead, con
                                        differ ? E : NULL, differ ? nu : NULL, NULL, &ref->e, NULL);
     if (r != TSS_OK) {
         tss__buf_free(&w->host, &ref->label);
-        return tss__fail(w, r, "elasticity of %s: %s", lead->name, tss_result_text(r));
+        return tss_world_fail(w, r, "elasticity of %s: %s", lead->name, tss_result_text(r));
     }
     ref->e->label = label;
     w->elastic_count++;
     tss_energy_def d = tss__elastic_def(ref->e);
-    d.cookie = TSS__COOKIE;
     r = tss_energy_add(w, &d, &ref->energy);
     if (r != TSS_OK) {
         tss__elastic_destroy(ref->e, &w->host);
@@ -8113,8 +8125,7 @@ static tss_result tss__elastic_make(tss_world *w, const tss__bodydata *lead, con
     }
     if (lead->material.damping <= 0) return TSS_OK;
     r = tss__damping_create(&w->host, ref->e, &d);
-    if (r != TSS_OK) return tss__fail(w, r, "damping of %s: %s", lead->name, tss_result_text(r));
-    d.cookie = TSS__COOKIE;
+    if (r != TSS_OK) return tss_world_fail(w, r, "damping of %s: %s", lead->name, tss_result_text(r));
     r = tss_energy_add(w, &d, &ref->damping);
     if (r != TSS_OK && d.destroy) d.destroy(d.user, &w->host);
     return r;
@@ -8187,7 +8198,7 @@ static tss_result tss__pcg_run(tss_world *w, const double *b, double *y, int bou
     d.tol = w->def.pcg_tol, d.max_iterations = bound;
     r = tss_pcg_solve(w->pcg, &d, b, y, info);
     w->info.linear_iterations += info->iterations;
-    return r == TSS_OK ? r : tss__fail(w, r, "pcg: %s", tss_result_text(r));
+    return r == TSS_OK ? r : tss_world_fail(w, r, "pcg: %s", tss_result_text(r));
 }
 
 // Adds shift · (mean of the diagonal) to A's diagonal.
@@ -8213,7 +8224,7 @@ static tss_result tss__chol_prepare(tss_world *w, tss_chol_info *info) {
         r = tss_chol_create(&w->host, &d, &w->chol);
     }
     if (r == TSS_OK) r = tss_chol_analyze(w->chol, &w->A.m, &w->C.m);
-    if (r != TSS_OK) return tss__fail(w, r, "cholesky: %s", tss_result_text(r));
+    if (r != TSS_OK) return tss_world_fail(w, r, "cholesky: %s", tss_result_text(r));
     tss_chol_get_info(w->chol, info);
     return TSS_OK;
 }
@@ -8227,7 +8238,7 @@ static tss_result tss__chol_run(tss_world *w, const double *b, double *y, tss_st
         if (r == TSS_OK) break;
         tss_chol_info info;
         tss_chol_get_info(w->chol, &info);
-        if (r != TSS_ERROR_SINGULAR) return tss__fail(w, r, "cholesky: %s", tss_result_text(r));
+        if (r != TSS_ERROR_SINGULAR) return tss_world_fail(w, r, "cholesky: %s", tss_result_text(r));
         int node = tss__i32(&w->node_of_row)[info.bad_row / w->dim];
         if (shift > 1) {
             tss__stop(w, TSS_STEP_LINEAR, "the matrix is not positive definite at node %d of %s", node,
@@ -8240,7 +8251,7 @@ static tss_result tss__chol_run(tss_world *w, const double *b, double *y, tss_st
     }
     memcpy(y, b, (size_t)(w->rows * w->dim) * sizeof(double));
     tss_result r = tss_chol_solve(w->chol, y, 1);
-    return r == TSS_OK ? r : tss__fail(w, r, "cholesky: %s", tss_result_text(r));
+    return r == TSS_OK ? r : tss_world_fail(w, r, "cholesky: %s", tss_result_text(r));
 }
 
 // Cost of one PCG iteration in dense flops.
@@ -8508,7 +8519,7 @@ tss_result tss_world_prepare(tss_world *w) {
     int soft = 0;
     for (int k = 0; k < w->body_count; k++)
         soft |= !TSS__BODY(w, k)->removed && TSS__BODY(w, k)->kind == TSS_BODY_SOFT;
-    if (!soft) return tss__fail(w, TSS_ERROR_EMPTY, "the scene has no soft body");
+    if (!soft) return tss_world_fail(w, TSS_ERROR_EMPTY, "the scene has no soft body");
     tss_result r;
     w->topology++;
     w->matrix_valid = 0;
@@ -8574,7 +8585,7 @@ static tss_result tss__lists(tss_world *w, int dynamic_only, const double *x, co
         tss__entry *e = TSS__ENTRY(w, k);
         if (!e->live || (dynamic_only && !(e->def.flags & TSS_ENERGY_DYNAMIC))) continue;
         tss_result r = e->def.lists(e->def.user, &w->ctx, x, d, t, &e->list);
-        if (r != TSS_OK) return tss__fail(w, r, "%s: %s", e->name, tss_result_text(r));
+        if (r != TSS_OK) return tss_world_fail(w, r, "%s: %s", e->name, tss_result_text(r));
     }
     return TSS_OK;
 }
@@ -8763,7 +8774,7 @@ static tss_result tss__start_newmark(tss_world *w) {
         tss__entry *e = TSS__ENTRY(w, k);
         if (!tss__in_matrix(e, 0) || !(e->def.flags & TSS_ENERGY_TIMES_AH2)) continue;
         tss_result r = e->def.lists(e->def.user, &w->ctx, tss__f64(&w->x_t), NULL, 0, &e->list);
-        if (r != TSS_OK) return tss__fail(w, r, "%s: %s", e->name, tss_result_text(r));
+        if (r != TSS_OK) return tss_world_fail(w, r, "%s: %s", e->name, tss_result_text(r));
         tss__gradient_serial(w, e, tss__f64(&w->x_t), g);
     }
     for (int k = 0; k < w->n * w->dim; k++) {
@@ -8855,12 +8866,42 @@ static double tss__target_left(const tss_world *w, const double *x) {
     return sqrt(worst);
 }
 
+static void tss__first_error(tss_severity severity, const char *text, void *arg) {
+    char *first = (char *)arg;
+    if (severity == TSS_SEVERITY_ERROR && !first[0]) snprintf(first, 240, "%.239s", text);
+}
+
+// No step can start from an intersection or an inverted cell that a barrier forbids: say which.
+static tss_result tss__check_start(tss_world *w) {
+    char first[240] = "";
+    for (int k = 0; k < w->entry_count; k++) {
+        tss__entry *e = TSS__ENTRY(w, k);
+        if (e->live && e->def.check)
+            e->def.check(e->def.user, &w->ctx, tss__f64(&w->x), tss__first_error, first);
+    }
+    if (first[0]) return tss_world_fail(w, TSS_ERROR_INTERSECTION, "%s", first);
+    for (int k = 0; k < w->elastic_count; k++) {
+        const tss__elastic_ref *r = &((const tss__elastic_ref *)w->elastics.p)[k];
+        int cell = -1;
+        if (!tss__elastic_has_barrier(r->e)) continue;
+        double J = tss__elastic_min_J(r->e, &w->host, tss__f64(&w->x), &cell);
+        if (J > 0) continue;
+        tss__elastic_describe(r->e, &w->ctx, cell, first, sizeof first);
+        return tss_world_fail(w, TSS_ERROR_BAD_STATE, "%s has J = %g at the start, expected > 0", first, J);
+    }
+    return TSS_OK;
+}
+
 static tss_result tss__begin_step(tss_world *w) {
     size_t bytes = (size_t)(w->n * w->dim) * sizeof(double);
     memcpy(w->x_t.p, w->x.p, bytes);
     memcpy(w->v_t.p, w->v.p, bytes);
     memcpy(w->x_k.p, w->x.p, bytes);
     tss__fill_ctx(w);
+    if (w->history == 0) {
+        tss_result bad = tss__check_start(w);
+        if (bad != TSS_OK) return bad;
+    }
     if (w->chol) tss_chol_forget(w->chol);  // a resumed run takes the same path
     tss_result r = TSS_OK;
     if (w->def.integrator == TSS_NEWMARK && w->history == 0) r = tss__start_newmark(w);
@@ -8876,7 +8917,7 @@ static tss_result tss__begin_step(tss_world *w) {
                 tss__entry *e = TSS__ENTRY(w, k);
                 if (!tss__in_matrix(e, 0)) continue;
                 r = e->def.lists(e->def.user, &w->ctx, tss__f64(&w->x_t), NULL, 0, &e->list);
-                if (r != TSS_OK) return tss__fail(w, r, "%s: %s", e->name, tss_result_text(r));
+                if (r != TSS_OK) return tss_world_fail(w, r, "%s: %s", e->name, tss_result_text(r));
             }
             r = tss__gradient_at(w, tss__f64(&w->x_t), tss__f64(&w->g), 0);
             if (r != TSS_OK) return r;
@@ -8887,7 +8928,7 @@ static tss_result tss__begin_step(tss_world *w) {
             if (!e->live || !e->def.begin_step) continue;
             if (!!(e->def.flags & TSS_ENERGY_WANTS_GRADIENT) != wanting) continue;
             r = e->def.begin_step(e->def.user, &w->ctx);
-            if (r != TSS_OK) return tss__fail(w, r, "%s: %s", e->name, tss_result_text(r));
+            if (r != TSS_OK) return tss_world_fail(w, r, "%s: %s", e->name, tss_result_text(r));
         }
     }
     w->ctx.g = NULL;
@@ -9079,7 +9120,7 @@ tss_result tss_world_step(tss_world *w, tss_step_info *info) { return tss__take_
 tss_result tss_world_step_for(tss_world *w, double seconds, tss_step_info *info) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
     if (!(seconds > 0) || !w->def.host.clock)
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "step_for: %g s, expected > 0 and a clock in the host",
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "step_for: %g s, expected > 0 and a clock in the host",
                          seconds);
     return tss__take_step(w, seconds, info);
 }
@@ -9133,7 +9174,8 @@ typedef struct tss__head {
     int64_t history;
     double time, ah2, dt, gravity[3], pcg_iterations;
     int64_t pcg_rest, order;  // order: nodes of the Cholesky ordering that follows the arrays
-    double order_flops;
+    double order_flops, tol;
+    int64_t drags;  // node, stiffness, target of each
 } tss__head;
 
 // The node arrays a checkpoint holds.
@@ -9143,6 +9185,23 @@ static int tss__saved(const tss_world *w, const tss__buf **list, size_t *bytes) 
                              &w->kind, &w->axes};
     for (int k = 0; k < 9; k++) list[k] = all[k], bytes[k] = k < 7 ? wide : n;
     return 9;
+}
+
+static size_t tss__drag_bytes(const tss_world *w) { return sizeof(int) + (size_t)(w->dim + 1) * sizeof(double); }
+
+// The springs of tss_node_drag to (save) or from a checkpoint; returns the bytes.
+static size_t tss__copy_drags(const tss_world *w, char *at, int drags, int save) {
+    const tss__buf *part[3] = {&w->drag_node, &w->drag_k, &w->drag_at};
+    size_t n = (size_t)drags, len[3], all = 0;
+    len[0] = n * sizeof(int), len[1] = n * sizeof(double), len[2] = n * (size_t)w->dim * sizeof(double);
+    for (int k = 0; k < 3; all += len[k], k++) {
+        if (len[k] == 0) continue;
+        if (save)
+            memcpy(at + all, part[k]->p, len[k]);
+        else
+            memcpy(part[k]->p, at + all, len[k]);
+    }
+    return all;
 }
 
 static size_t tss__energy_state(const tss_world *w, const tss__entry *e, void *data, size_t size, int save) {
@@ -9156,7 +9215,7 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     int count = tss__saved(w, list, bytes);
     for (int k = 0; k < count; k++) need += bytes[k];
     int order = w->chol ? tss_chol_get_order(w->chol, NULL, NULL) : 0;
-    need += (size_t)order * sizeof(int);
+    need += (size_t)order * sizeof(int) + (size_t)w->drags * tss__drag_bytes(w);
     for (int k = 0; k < w->entry_count; k++)
         need += sizeof(uint64_t) + tss__energy_state(w, TSS__ENTRY(w, k), NULL, 0, 1);
     if (!data) return need;
@@ -9168,13 +9227,14 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     h.time = w->time, h.ah2 = w->ctx.ah2, h.dt = w->def.dt;
     h.pcg_iterations = w->pcg_iterations, h.pcg_rest = w->pcg_rest;
     memcpy(h.gravity, w->def.gravity, sizeof h.gravity);
-    h.order = order;
+    h.order = order, h.drags = w->drags, h.tol = w->def.tol;
     if (w->chol) tss_chol_get_order(w->chol, NULL, &h.order_flops);
     char *to = (char *)data;
     memcpy(to, &h, sizeof h), to += sizeof h;
     for (int k = 0; k < count; k++) memcpy(to, list[k]->p, bytes[k]), to += bytes[k];
     if (order > 0) tss_chol_get_order(w->chol, (int *)(void *)to, NULL);
     to += (size_t)order * sizeof(int);
+    to += tss__copy_drags(w, to, w->drags, 1);
     for (int k = 0; k < w->entry_count; k++) {
         uint64_t len = tss__energy_state(w, TSS__ENTRY(w, k), NULL, 0, 1);
         memcpy(to, &len, sizeof len), to += sizeof len;
@@ -9221,23 +9281,28 @@ tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
     size_t bytes[9], fixed = sizeof h;
     int count = tss__saved(w, list, bytes);
     for (int k = 0; k < count; k++) fixed += bytes[k];
-    if (size < sizeof h) return tss__fail(w, TSS_ERROR_FORMAT, "checkpoint: %zu bytes are too few", size);
+    if (size < sizeof h) return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %zu bytes are too few", size);
     memcpy(&h, data, sizeof h);
     if (h.magic != TSS__MAGIC || h.version != 1)
-        return tss__fail(w, TSS_ERROR_FORMAT, "checkpoint: not one of this version");
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: not one of this version");
     if (h.dim != (uint64_t)w->dim || h.n != (uint64_t)w->n || h.energies != (uint64_t)w->entry_count)
-        return tss__fail(w, TSS_ERROR_MISMATCH,
+        return tss_world_fail(w, TSS_ERROR_MISMATCH,
                          "checkpoint: %llu nodes in %llu dimensions, %llu energies; the scene has %d, %d, %d",
                          (unsigned long long)h.n, (unsigned long long)h.dim, (unsigned long long)h.energies,
                          w->n, w->dim, w->entry_count);
     if (h.order < 0 || h.order > w->n)
-        return tss__fail(w, TSS_ERROR_FORMAT, "checkpoint: an ordering of %lld nodes", (long long)h.order);
-    fixed += (size_t)h.order * sizeof(int);
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: an ordering of %lld nodes", (long long)h.order);
+    if (h.drags < 0 || h.drags > w->n)
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %lld dragged nodes", (long long)h.drags);
+    fixed += (size_t)h.order * sizeof(int) + (size_t)h.drags * tss__drag_bytes(w);
     if (size < fixed || !tss__load_energies(w, (const char *)data + fixed, size - fixed, 0))
-        return tss__fail(w, TSS_ERROR_FORMAT, "checkpoint: cut short or of another scene");
-    r = tss__load_order(w, (const char *)data + fixed - (size_t)h.order * sizeof(int), (int)h.order,
-                        h.order_flops);
-    if (r != TSS_OK) return tss__fail(w, r, "checkpoint: ordering: %s", tss_result_text(r));
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: cut short or of another scene");
+    const char *more = (const char *)data + fixed - (size_t)h.drags * tss__drag_bytes(w);
+    r = tss__drags_reserve(w, (size_t)h.drags);
+    if (r == TSS_OK) r = tss__load_order(w, more - (size_t)h.order * sizeof(int), (int)h.order, h.order_flops);
+    if (r != TSS_OK) return tss_world_fail(w, r, "checkpoint: ordering: %s", tss_result_text(r));
+    tss__copy_drags(w, (char *)(uintptr_t)more, (int)h.drags, 0);
+    w->drags = (int)h.drags, w->drag_pattern++, w->def.tol = h.tol;
     const char *from = (const char *)data + sizeof h;
     int kinds_change = memcmp(from + 7 * bytes[0], w->kind.p, bytes[7]) ||
                        memcmp(from + 7 * bytes[0] + bytes[7], w->axes.p, bytes[8]);
@@ -9251,7 +9316,7 @@ tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
     }
     tss__fill_ctx(w);
     if (!tss__load_energies(w, (const char *)data + fixed, size - fixed, 1))
-        return tss__fail(w, TSS_ERROR_MISMATCH, "checkpoint: an energy refused its state");
+        return tss_world_fail(w, TSS_ERROR_MISMATCH, "checkpoint: an energy refused its state");
     return TSS_OK;
 }
 
@@ -9463,7 +9528,7 @@ tss_result tss_energy_check(tss_world *w, tss_energy id, tss_energy_report *out)
     tss_result r = tss_world_prepare(w);
     if (r != TSS_OK) return r;
     if (id < 0 || id >= w->entry_count || !TSS__ENTRY(w, id)->live)
-        return tss__fail(w, TSS_ERROR_NOT_FOUND, "no energy %d", id);
+        return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no energy %d", id);
     size_t bytes = (size_t)(w->n * w->dim) * sizeof(double);
     memcpy(w->x_trial.p, w->x.p, bytes);
     tss__fd f;
@@ -9496,7 +9561,7 @@ tss_result tss_energy_check(tss_world *w, tss_energy id, tss_energy_report *out)
 // ---------------------------------------------------------------------------------------------
 
 struct tss_embedding {
-    const tss_host *host;
+    tss_host host;  // the caller's, so that it may outlive the world
     int dim, count;
     tss__buf node;    // int, count × (dim + 1)
     tss__buf weight;  // double, count × (dim + 1)
@@ -9607,16 +9672,16 @@ tss_result tss_embedding_create(tss_world *w, tss_body id, const double *points,
     if (!w || !out) return TSS_ERROR_BAD_ARGUMENT;
     *out = NULL;
     if (!tss__has_body(w, id) || TSS__BODY(w, id)->cells == 0)
-        return tss__fail(w, TSS_ERROR_NOT_FOUND, "no body %d with cells to carry points", id);
+        return tss_world_fail(w, TSS_ERROR_NOT_FOUND, "no body %d with cells to carry points", id);
     if (count < 0 || (count > 0 && !points))
-        return tss__fail(w, TSS_ERROR_BAD_ARGUMENT, "embedding: %d points but no array of them", count);
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "embedding: %d points but no array of them", count);
     tss_result r = tss__finite(w, "embedded point", points, count * w->dim);
     if (r != TSS_OK) return r;
-    const tss_host *host = &w->def.host;  // outlives the world's counting
+    const tss_host *host = &w->def.host;
     tss_embedding *e = (tss_embedding *)tss_alloc(host, sizeof *e);
     if (!e) return tss__no_memory(w);
     memset(e, 0, sizeof *e);
-    e->host = host, e->dim = w->dim, e->count = count;
+    e->host = *host, e->dim = w->dim, e->count = count;
     size_t size = (size_t)count * (size_t)(w->dim + 1);
     tss__grid g;
     memset(&g, 0, sizeof g);
@@ -9637,8 +9702,9 @@ tss_result tss_embedding_create(tss_world *w, tss_body id, const double *points,
 
 void tss_embedding_destroy(tss_embedding *e) {
     if (!e) return;
-    tss__buf_free(e->host, &e->node), tss__buf_free(e->host, &e->weight);
-    tss_free(e->host, e, sizeof *e);
+    tss_host host = e->host;
+    tss__buf_free(&host, &e->node), tss__buf_free(&host, &e->weight);
+    tss_free(&host, e, sizeof *e);
 }
 
 void tss_embedding_update(const tss_embedding *e, const tss_world *w, float *out) {

@@ -16,7 +16,7 @@
  * Contact is two energies (barrier, friction) on the public hook of tss.h; the distances, the
  * barrier and the collision detection below can be called on their own.
  *
- * Options: TSS_NO_SIMD  no intrinsics: plain loops, the same bits, a slower search
+ * Options: TSS_NO_SIMD  no intrinsics: plain loops, a slower search
  * Memory, threads, determinism, errors: as in tss.h. License: MIT (see the end of tss.h).
  */
 #ifndef TSS_IPC_H
@@ -4558,23 +4558,30 @@ tss_ipc_def tss_ipc_def_default(void) {
 
 static int tss__ipc_not_negative(double v) { return v >= 0 && v < HUGE_VAL; }
 
-static int tss__ipc_def_ok(const tss_ipc_def *d, int dim) {
-    if (d->cookie != TSS__IPC_COOKIE || !tss__ipc_not_negative(d->dhat)) return 0;
-    if (!(d->dhat > 0) && !(d->dhat_rel > 0 && d->dhat_rel < HUGE_VAL)) return 0;
-    if (!tss__ipc_not_negative(d->dhat_edge) || !tss__ipc_not_negative(d->kappa)) return 0;
-    if (!tss__ipc_not_negative(d->mu) || !tss__ipc_not_negative(d->eps_v)) return 0;
-    if (d->friction_iterations < 1 || !(d->slack > 0 && d->slack < 1) || d->max_candidates < 1)
-        return 0;
-    if (d->planes < 0 || d->bodies < 0 || d->pairs < 0) return 0;
-    if ((d->planes && !d->plane) || (d->bodies && !d->body) || (d->pairs && !d->pair)) return 0;
+// What is wrong with a def, or NULL.
+static const char *tss__ipc_def_fault(const tss_ipc_def *d, int dim) {
+    if (d->cookie != TSS__IPC_COOKIE) return "start from tss_ipc_def_default()";
+    if (!tss__ipc_not_negative(d->dhat)) return "dhat, expected >= 0";
+    if (!(d->dhat > 0) && !(d->dhat_rel > 0 && d->dhat_rel < HUGE_VAL)) return "dhat_rel, expected > 0";
+    if (!tss__ipc_not_negative(d->dhat_edge)) return "dhat_edge, expected >= 0";
+    if (!tss__ipc_not_negative(d->kappa)) return "kappa, expected >= 0";
+    if (!tss__ipc_not_negative(d->mu)) return "mu, expected >= 0";
+    if (!tss__ipc_not_negative(d->eps_v)) return "eps_v, expected >= 0";
+    if (d->friction_iterations < 1) return "friction_iterations, expected >= 1";
+    if (!(d->slack > 0 && d->slack < 1)) return "slack, expected between 0 and 1";
+    if (d->max_candidates < 1) return "max_candidates, expected >= 1";
+    if (d->planes < 0 || (d->planes && !d->plane)) return "planes without an array of them";
+    if (d->bodies < 0 || (d->bodies && !d->body)) return "bodies without an array of them";
+    if (d->pairs < 0 || (d->pairs && !d->pair)) return "pairs without an array of them";
     for (int k = 0; k < d->planes; k++) {
         double s = 0;
         for (int a = 0; a < dim; a++) s += d->plane[k].normal[a] * d->plane[k].normal[a];
-        if (!(s > 0 && s < HUGE_VAL) || !tss__ipc_not_negative(d->plane[k].mu)) return 0;
+        if (!(s > 0 && s < HUGE_VAL)) return "a plane's normal, expected finite and not 0";
+        if (!tss__ipc_not_negative(d->plane[k].mu)) return "a plane's mu, expected >= 0";
         for (int a = 0; a < dim; a++)
-            if (!(fabs(d->plane[k].origin[a]) < HUGE_VAL)) return 0;
+            if (!(fabs(d->plane[k].origin[a]) < HUGE_VAL)) return "a plane's origin, expected finite";
     }
-    return 1;
+    return NULL;
 }
 
 static int tss__ipc_copy(const tss_host *host, void **to, const void *from, int count,
@@ -4639,8 +4646,10 @@ static tss_energy_def tss__ipc_friction_def(tss_ipc *p, int dim) {
 
 tss_result tss_ipc_add(tss_world *w, const tss_ipc_def *def, tss_ipc **out) {
     if (out) *out = NULL;
-    if (!w || !def || !tss__ipc_def_ok(def, tss_world_dim(w))) return TSS_ERROR_BAD_ARGUMENT;
+    if (!w || !def) return TSS_ERROR_BAD_ARGUMENT;
     int dim = tss_world_dim(w);
+    const char *fault = tss__ipc_def_fault(def, dim);
+    if (fault) return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "contact: %s", fault);
     tss_ipc *p;
     tss_result r = tss__ipc_create(w, def, dim, &p);
     if (r != TSS_OK) return r;

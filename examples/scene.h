@@ -32,7 +32,7 @@
    solver.linear           auto | direct | pcg (auto)
    solver.pcg_tol          relative residual of the linear solve (1e-5)
    solver.pcg_iterations   bound on its iterations (10000)
-   contact.enabled         bodies touch (true)
+   contact.enabled         bodies and planes touch (true)
    contact.dhat            distance at which contact begins, m (0: use dhat_rel)
    contact.dhat_rel        the same over the diagonal (1e-3)
    contact.dhat_edge       with dhat_rel: at most this share of the shortest surface edge (0.5)
@@ -2324,7 +2324,7 @@ int scene_build(scene *s, const tss_host *host,
         forces += s->body[k].forces;
     }
     ok = ok && scene__add_script(s, error);
-    if (ok && (s->contact.enabled || s->planes > 0)) ok = scene__add_contact(s, w, ipc, error);
+    if (ok && s->contact.enabled) ok = scene__add_contact(s, w, ipc, error);
     s->forces_on = (char *)calloc((size_t)forces + 1, 1);
     if (ok && !s->forces_on) ok = scene__fail(error, "out of memory");
     if (ok && (r = tss_world_prepare(w)) != TSS_OK) ok = scene__world_fail(error, s, w, r);

@@ -389,7 +389,7 @@ static int judge_begin(run *r, int *cells[2], int *edges) {
         m.points = f.point, m.n_points = f.points;
     }
     m.body = r->node_body, m.kinematic = r->kinematic, m.self_contact = r->s.contact.self;
-    judge_planes(r, &m);
+    if (r->s.contact.enabled) judge_planes(r, &m);
     r->judge = check_begin(&m, tss_world_positions(r->w));
     m.cells = cells[0], m.n_cells = gather_cells(r, 0, cells[0]);
     m.n_triangles = m.n_edges = m.n_points = m.n_halfspaces = 0;

@@ -98,6 +98,17 @@ compat() {
     # shellcheck disable=SC2086
     (cd "$dir" && c++ -std=c++17 $bare hello.cpp -lm -o hellopp) >"$log/hellopp.build" 2>&1 && ok "hello as C++" ||
         bad "hello as C++" "$log/hellopp.build"
+    # The programs in README and manual compile and run as printed.
+    for doc in README.md docs/manual.md; do
+        awk -v d="$dir" -v n="$(basename $doc .md)" '/^```c$/ {k++; f=d "/" n k ".c"; next} /^```/ {f=""} f {print > f}' $doc
+    done
+    for f in "$dir"/README*.c "$dir"/manual*.c; do
+        grep -q 'int main' "$f" 2>/dev/null || continue
+        grep -q TSS_IMPLEMENTATION "$f" || { { printf '#define TSS_IMPLEMENTATION\n#include "tss.h"\n#include <stdio.h>\n'; cat "$f"; } >"$f.c"; f=$f.c; }
+        # shellcheck disable=SC2086
+        if $cc $bare -I. "$f" -lm -o "$f.exe" >"$log/doc.build" 2>&1 && "$f.exe" >"$log/doc.run" 2>&1
+        then ok "documentation: $(basename "$f")"; else bad "documentation: $(basename "$f")" "$log/doc.build"; fi
+    done
     for comp in gcc clang g++ clang++; do
         command -v $comp >/dev/null 2>&1 || continue
         case $comp in *++) std="-std=c++17 -x c++" ;; *) std=-std=c11 ;; esac

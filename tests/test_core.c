@@ -311,6 +311,60 @@ static void test_cantilever(void **state) {
     near(last / exact, 1, 0.10);
 }
 
+// ---- shells -----------------------------------------------------------------------------------
+
+// A cloth of membrane and hinge energies, hung by two corners: derivatives agree with differences,
+// it sags below its corners and keeps its area within a few per cent.
+static void test_cloth(void **state) {
+    (void)state;
+    enum { N = 6, NODES = (N + 1) * (N + 1) };
+    double X[3 * NODES];
+    int tri[6 * N * N], t = 0;
+    for (int i = 0; i < NODES; i++) X[3 * i] = i % (N + 1) / (double)N, X[3 * i + 1] = 0, X[3 * i + 2] = i / (N + 1) / (double)N;
+    for (int j = 0; j < N; j++)
+        for (int i = 0; i < N; i++) {
+            int a = j * (N + 1) + i, q[6] = {a, a + N + 1, a + 1, a + 1, a + N + 1, a + N + 2};
+            for (int k = 0; k < 6; k++) tri[t++] = q[k];
+        }
+    tss_world *w = make_world(tss_world_def_default());
+    tss_body_def b = tss_body_def_default();
+    b.nodes = NODES, b.X = X, b.triangles = t / 3, b.triangle = tri, b.thickness = 1e-3, b.material.rho = 300;
+    int pins[2] = {0, N};
+    b.pins = 2, b.pin = pins;
+    add_body(w, &b);
+    tss_membrane_def md = tss_membrane_def_default();
+    md.triangles = t / 3, md.node = tri, md.X = X, md.thickness = 1e-3, md.material.E = 1e6;
+    tss_energy_def e;
+    tss_energy membrane, hinge;
+    assert_int_equal(tss_membrane_energy(tss_world_host(w), &md, &e), TSS_OK);
+    assert_int_equal(tss_energy_add(w, &e, &membrane), TSS_OK);
+    tss_hinge_def hd = tss_hinge_def_default();
+    int hinges[4 * 6 * N * N], m = 0;
+    for (int i = 0; i < t; i++)  // edge a → b of one triangle that is b → a of another
+        for (int j = 0; j < t; j++) {
+            int a = tri[i], b2 = tri[i / 3 * 3 + (i + 1) % 3];
+            if (a > b2 || tri[j] != b2 || tri[j / 3 * 3 + (j + 1) % 3] != a) continue;
+            hinges[m++] = a, hinges[m++] = b2;
+            hinges[m++] = tri[i / 3 * 3 + (i + 2) % 3], hinges[m++] = tri[j / 3 * 3 + (j + 2) % 3];
+        }
+    hd.hinges = m / 4, hd.node = hinges, hd.X = X;
+    assert_int_equal(tss_hinge_energy(tss_world_host(w), &hd, &e), TSS_OK);
+    assert_int_equal(tss_energy_add(w, &e, &hinge), TSS_OK);
+    for (int s = 0; s < 40; s++) step(w);
+    const double *x = tss_world_positions(w);
+    double area = 0, lowest = 0;
+    for (int k = 0; k < t / 3; k++) area += tss__triangle_area(x + 3 * tri[3 * k], x + 3 * tri[3 * k + 1], x + 3 * tri[3 * k + 2]);
+    for (int i = 0; i < NODES; i++) lowest = fmin(lowest, x[3 * i + 1]);
+    assert_true(lowest < -0.3 && lowest > -1.5);
+    near(area, 1, 0.05);
+    tss_energy_report r;
+    assert_int_equal(tss_energy_check(w, membrane, &r), TSS_OK);
+    assert_true(r.gradient_error < 1e-5 && r.gradient_error > 0 && r.psd_min > -1e-9);
+    assert_int_equal(tss_energy_check(w, hinge, &r), TSS_OK);
+    assert_true(r.gradient_error < 1e-4 && r.psd_min > -1e-9);
+    tss_world_destroy(w);
+}
+
 // ---- kinematic nodes --------------------------------------------------------------------------
 
 // Ends turned against each other by 144° in one step: targets met exactly, nothing inverted.
@@ -488,6 +542,26 @@ static void test_bad_worlds(void **state) {
     tss_world_destroy(NULL);
 }
 
+// A cell inside out at the start of a barrier material cannot be stepped; it is named.
+static void test_bad_start(void **state) {
+    (void)state;
+    double X[12] = {0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1}, x0[12];
+    int tet[4] = {0, 1, 2, 3};
+    memcpy(x0, X, sizeof x0), x0[11] = -1;
+    tss_world *w = make_world(tss_world_def_default());
+    tss_body_def b = tss_body_def_default();
+    b.nodes = 4, b.X = X, b.cells = 1, b.cell = tet, b.x0 = x0;
+    add_body(w, &b);
+    assert_int_equal(tss_world_step(w, NULL), TSS_ERROR_BAD_STATE);
+    assert_non_null(strstr(tss_world_error(w), "tet 0"));
+    tss_check_report report;
+    assert_int_equal(tss_world_check(w, &report), TSS_OK);
+    assert_int_equal(report.errors, 1);
+    assert_int_equal(tss_body_teleport(w, 0, X, NULL), TSS_OK);
+    step(w);
+    tss_world_destroy(w);
+}
+
 // A mesh drawn in millimetres is 1,000 times too large.
 static void test_millimetres(void **state) {
     (void)state;
@@ -561,7 +635,8 @@ int main(void) {
         cmocka_unit_test(test_free_fall),   cmocka_unit_test(test_momentum),
         cmocka_unit_test(test_order),       cmocka_unit_test(test_patch),
         cmocka_unit_test(test_compression), cmocka_unit_test(test_cantilever),
-        cmocka_unit_test(test_twist),       cmocka_unit_test(test_same_bits),
+        cmocka_unit_test(test_twist),       cmocka_unit_test(test_cloth),
+        cmocka_unit_test(test_bad_start),         cmocka_unit_test(test_same_bits),
         cmocka_unit_test(test_checkpoint),  cmocka_unit_test(test_bad_bodies),
         cmocka_unit_test(test_bad_worlds),  cmocka_unit_test(test_millimetres),
         cmocka_unit_test(test_no_memory),

@@ -157,6 +157,31 @@ static void test_resume(void **unused) {
     tss_world_destroy(a.w), tss_world_destroy(b.w);
 }
 
+// Two tetrahedra pushed into each other: no step starts, and the pair is named.
+static void test_bad_start(void **unused) {
+    (void)unused;
+    double X[12] = {0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1}, Y[12];
+    int tet[4] = {0, 1, 2, 3};
+    tss_world_def wd = tss_world_def_default();
+    tss_world *w;
+    assert_int_equal(tss_world_create(&wd, &w), TSS_OK);
+    tss_body_def b = tss_body_def_default();
+    b.nodes = 4, b.X = X, b.cells = 1, b.cell = tet, b.name = "left";
+    assert_int_equal(tss_body_add(w, &b, NULL), TSS_OK);
+    for (int k = 0; k < 12; k++) Y[k] = X[k] + 0.1;
+    b.X = Y, b.name = "right";
+    assert_int_equal(tss_body_add(w, &b, NULL), TSS_OK);
+    tss_ipc_def c = tss_ipc_def_default();
+    assert_int_equal(tss_ipc_add(w, &c, NULL), TSS_OK);
+    assert_int_equal(tss_world_step(w, NULL), TSS_ERROR_INTERSECTION);
+    print_message("    %s\n", tss_world_error(w));
+    assert_non_null(strstr(tss_world_error(w), "triangle"));
+    c.slack = 2;
+    assert_int_equal(tss_ipc_add(w, &c, NULL), TSS_ERROR_BAD_ARGUMENT);
+    assert_non_null(strstr(tss_world_error(w), "slack"));
+    tss_world_destroy(w);
+}
+
 // A block on a slope: stays above the friction angle's coefficient, slides below it.
 static void test_slope(void **unused) {
     (void)unused;
@@ -204,6 +229,6 @@ static void test_slope(void **unused) {
 int main(void) {
     const struct CMUnitTest tests[] = {cmocka_unit_test(test_pile),
                                        cmocka_unit_test(test_energy_check),
-                                       cmocka_unit_test(test_resume), cmocka_unit_test(test_slope)};
+                                       cmocka_unit_test(test_resume), cmocka_unit_test(test_slope), cmocka_unit_test(test_bad_start)};
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

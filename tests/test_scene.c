@@ -265,6 +265,29 @@ static void test_release(void **state) {
     scene_free(&s);
 }
 
+// A motion that starts late takes the nodes from where they have fallen to.
+static void test_capture(void **state) {
+    scene s;
+    double y[4];
+    (void)state;
+    read_ok(
+        &s,
+        "{\"world\": {\"dt\": 0.1, \"integrator\": \"euler\"}, \"contact\": {\"enabled\": false},"
+        "\"bodies\": [{" BOX
+        ", \"pins\": [{\"lower\": [0, 1, 0], \"release\": true, \"motion\":"
+        "{\"start\": 0.2, \"end\": 0.4, \"velocity\": [0, 1, 0]}}]}]}");
+    const int *top = s.body[0].pin[0].node;
+    tss_world *w = build(&s);
+    assert_int_equal(s.body[0].pin[0].nodes, 4);
+    steps(&s, w, 2);
+    for (int i = 0; i < 4; i++) y[i] = tss_world_positions(w)[3 * top[i] + 1];
+    near_to(y[0], 0.5 - 3 * 0.0980665, 1e-6);
+    steps(&s, w, 2);
+    for (int i = 0; i < 4; i++) near_to(tss_world_positions(w)[3 * top[i] + 1], y[i] + 0.2, 1e-9);
+    tss_world_destroy(w);
+    scene_free(&s);
+}
+
 // Implicit Euler under a constant acceleration a: v = a t, and the force stops at its end.
 static void test_forces(void **state) {
     scene s;
@@ -588,6 +611,7 @@ int main(void) {
                                        cmocka_unit_test(test_keyframes),
                                        cmocka_unit_test(test_pin_motion),
                                        cmocka_unit_test(test_release),
+                                       cmocka_unit_test(test_capture),
                                        cmocka_unit_test(test_forces),
                                        cmocka_unit_test(test_spin),
                                        cmocka_unit_test(test_resume),
