@@ -560,7 +560,7 @@ typedef struct tss_world_def {
     double tol;          // ε: converged when ‖d‖∞/h ≤ tol, m/s; 0: use tol_rel; default 0
     double tol_rel;      // tol = tol_rel × diagonal of the rest bounding box, 1/s; default 1e-2.
                          // Quasi-static: converged when ‖d‖∞ ≤ 1e-3 · tol_rel × diagonal.
-    int max_iterations;  // Newton iterates a step may take in all; default 500
+    int max_iterations;  // Newton iterates a step may take in all; default 2000
     tss_linear linear;   // default TSS_LINEAR_AUTO
     double pcg_tol;      // relative residual of the linear solve; default 1e-5
     int pcg_iterations;  // bound on the iterations of one linear solve; default 10000
@@ -8306,7 +8306,7 @@ tss_world_def tss_world_def_default(void) {
     d.dt = 0.01;
     d.gravity[1] = -9.80665;
     d.tol_rel = 1e-2;
-    d.max_iterations = 500;
+    d.max_iterations = 2000;
     d.pcg_tol = 1e-5;
     d.pcg_iterations = 10000;
     d.cookie = TSS__COOKIE;
@@ -8558,6 +8558,7 @@ typedef struct tss__iter {
     double t_max;        // what the step filters allow
     double alpha;        // accepted
     char limit[128];     // who limited the step
+    double tol;          // ‖d‖∞ that counts as converged
     int small_steps;     // iterates in a row with tiny steps
 } tss__iter;
 
@@ -8738,7 +8739,9 @@ static tss_result tss__line_search(tss_world *w, tss__iter *it, int *found) {
         double rise = 0;
         if (it->s > 0)
             rise = 1.5 * tss__max(0, alpha * allow.slope + 0.5 * alpha * alpha * allow.curvature);
-        int ok = isfinite(E) && E <= it->E + rise + 1e-4 * alpha * tss__min(it->gd, 0);
+        // Where the unknowns have nothing left to do, only prescribed motion changes E.
+        int idle = it->s > 0 && it->dnorm <= it->tol;
+        int ok = isfinite(E) && (idle || E <= it->E + rise + 1e-4 * alpha * tss__min(it->gd, 0));
         if (!ok && isfinite(E) && E <= it->E + noise) {
             r = tss__gradient_at(w, tss__f64(&w->x_trial), tss__f64(&w->g_trial), 1);
             double slope = tss__dot_blocks(tss__f64(&w->g_trial), tss__f64(&w->d), w->n * w->dim);
@@ -8961,7 +8964,7 @@ static void tss__adapt_theta(tss__iter *it) {
 
 // One solve: iterates until converged or stopped (w->info.status says which).
 static tss_result tss__solve(tss_world *w, tss__iter *it) {
-    double tol = tss__tolerance(w);
+    double tol = it->tol = tss__tolerance(w);
     w->info.status = TSS_STEP_CONVERGED;
     for (;;) {
         if (w->info.newton >= w->def.max_iterations) {

@@ -28,7 +28,7 @@
    world.integrator        bdf2 | euler | newmark | quasistatic (bdf2)
    solver.tol              stop when |d|/h is below this, m/s (0: use tol_rel)
    solver.tol_rel          the same over the diagonal of the soft bodies' box, 1/s (1e-2)
-   solver.max_iterations   Newton iterates a step (500)
+   solver.max_iterations   Newton iterates a step (2000)
    solver.linear           auto | direct | pcg (auto)
    solver.pcg_tol          relative residual of the linear solve (1e-5)
    solver.pcg_iterations   bound on its iterations (10000)
