@@ -46,8 +46,8 @@ int main(void) {
         return printf("%s\n", w ? tss_world_error(w) : "no memory"), 1;
     for (int step = 0; step < 200; step++) {
         tss_step_info info;
-        if (tss_world_step(w, &info) != TSS_OK || info.status != TSS_STEP_CONVERGED)
-            return printf("step %d: %s\n", step, tss_world_error(w)), 1;
+        if (tss_world_step(w, &info) != TSS_OK) return printf("%s\n", tss_world_error(w)), 1;
+        if (info.status != TSS_STEP_CONVERGED) return printf("step %d: %s\n", step, info.message), 1;
     }
     for (int k = 0; k < NODES; k++) middle += tss_world_positions(w)[3 * k + 1] / NODES;
     printf("middle at %.3f m\n", middle);

@@ -72,10 +72,10 @@ static int version(void) {
 #else
            "serial",
 #endif
-#ifdef TSS_NO_LAPACK
-           "built-in dense kernels",
+#ifdef TSS_NO_SIMD
+           "plain loops",
 #else
-           "BLAS and LAPACK",
+           "SIMD",
 #endif
 #ifdef TSS_NO_METIS
            "built-in ordering",
@@ -1138,7 +1138,8 @@ static int command_check(run *r) {
     static const char *const words[] = {"note", "warning", "error"};
     tss_check_report c;
     tss_result e;
-    if (!read_scene(r) || !build_world(r)) return 1;
+    if (!read_scene(r)) return 2;
+    if (!build_world(r)) return 1;
     if ((e = tss_world_check(r->w, &c)) != TSS_OK)
         return fail(r, "%s: %s", r->o.scene,
                     tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e)),

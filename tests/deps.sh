@@ -31,7 +31,7 @@ elif command -v brew >/dev/null 2>&1; then
     echo "deps: installing$missing"
     brew install $missing
 else
-    echo "deps: no apt, dnf or brew here; please install: OpenBLAS, METIS, cJSON, libpng, cmocka" >&2
+    echo "deps: no apt, dnf or brew here; please install: METIS, cJSON, libpng, cmocka" >&2
     exit 1
 fi
 echo "deps: done"
