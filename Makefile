@@ -16,9 +16,14 @@ LIBS   := $(if $(BREW),-L$(BREW)/lib) -lmetis -lm
 ALL    := $(STD) $(CFLAGS) $(WARN) $(OPENMP) $(if $(BREW),-I$(BREW)/include) -I. -Iexamples -Itests $(DEFS)
 # Tests compile the headers many times over: -O1 keeps that short, and bits do not depend on it.
 TEST_CFLAGS ?= -O1 -march=native -g
-MAKEFLAGS += -j$(shell nproc 2>/dev/null || echo 2)
+JOBS := $(shell nproc 2>/dev/null || echo 2)
 
-.PHONY: help all deps demo test examples run-examples bench sanitize fuzz nodeps compat clean
+# Goals in the order given (deps before the rest); programs side by side in a make of their own.
+ifndef PARALLEL
+.NOTPARALLEL:
+endif
+
+.PHONY: help all deps demo test test-programs examples run-examples bench sanitize fuzz nodeps compat clean
 
 all: examples
 
@@ -60,8 +65,11 @@ $(BUILD)/bench_%: bench/bench_%.c $(HEADERS)
 TESTS := $(patsubst tests/%.c,$(BUILD)/%,$(wildcard tests/test_*.c))
 
 #: test          every test in every configuration; ends with `N passed, N failed`
-test: $(TESTS) $(BUILD)/contact_reference $(BUILD)/ccd_queries examples
+test:
+	@$(MAKE) -s -j$(JOBS) PARALLEL=1 test-programs
 	@sh tests/run.sh $(BUILD)
+
+test-programs: $(TESTS) $(BUILD)/contact_reference $(BUILD)/ccd_queries examples
 
 #: sanitize      the tests under ASan+UBSan, and under TSan with a pthread pool
 #: nodeps        the tests with each TSS_NO_* alone and with all of them
