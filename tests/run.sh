@@ -50,13 +50,13 @@ libs() { case "$1" in *NO_METIS*) ;; *) printf -- '-lmetis ';; esac; printf -- '
 
 # variant NAME FLAGS TEST...: builds and runs test programs with other flags.
 variant() {
-    name=$1; flags=$2; shift 2
+    config=$1; flags=$2; shift 2
     for t in "$@"; do
-        exe="$build/${t}_$name"
+        exe="$build/${t}_$config"
         # shellcheck disable=SC2086
         if $cc -std=c11 -O1 -g $warn $inc $flags "tests/$t.c" -o "$exe" -lcmocka -lcjson -lpng $(libs "$flags") -lpthread \
-            >"$log/${t}_$name.build" 2>&1 && [ ! -s "$log/${t}_$name.build" ]
-        then suite "$t [$name]" "$exe"; else bad "$t [$name] does not build without a warning" "$log/${t}_$name.build"; fi
+            >"$log/${t}_$config.build" 2>&1 && [ ! -s "$log/${t}_$config.build" ]
+        then suite "$t [$config]" "$exe"; else bad "$t [$config] does not build without a warning" "$log/${t}_$config.build"; fi
     done
 }
 

@@ -846,7 +846,7 @@ static void test_pcg(void **state) {
         memset(ref, 0, sizeof(double) * (size_t)N);
         assert_int_equal(tss_pcg_solve(p, &def, ref, x, &info), TSS_OK);
         for (int i = 0; i < N; i++) assert_true(x[i] == 0);
-        memset(fixed, 1, (size_t)N);
+        for (int i = 0; i < N; i++) fixed[i] = 1;
         assert_int_equal(tss_pcg_solve(p, &def, b, x, &info), TSS_OK);
         assert_int_equal(info.status, TSS_PCG_CONVERGED);
         for (int i = 0; i < N; i++) assert_true(x[i] == b[i]);
