@@ -213,6 +213,10 @@ typedef struct tss_ipc_contact {
 TSS_API tss_result tss_ipc_contacts(tss_ipc *p, int max, tss_ipc_contact *out, int *count);
 // Force of contact and friction on each node, N (out: nodes × dim). The same state and errors.
 TSS_API tss_result tss_ipc_forces(tss_ipc *p, double *out);
+// Contact pressure on each node, Pa (out: nodes): the size of the barrier's force over the node's
+// share of the surface as it is now (a third of its triangles; 2D: half of its edges, 1 m deep). 0
+// where nothing touches and for nodes without area (free points and segments).
+TSS_API tss_result tss_ipc_pressures(tss_ipc *p, double *out);
 
 // Bodies that touch (nearer than d̂) and since when.
 typedef struct tss_ipc_touch {
@@ -3352,6 +3356,7 @@ struct tss_ipc {
     // κ
     double kappa, kappa_min, kappa_max;
     int thin;                     // iterates in a row with a pair far inside d̂
+    tss__ipc_array close_old;
     tss__ipc_array close;  // pairs below 1e-9 l at the last iterate: 5 ints and a distance
     int closes;
     tss__ipc_array work;
@@ -3908,9 +3913,11 @@ static tss_result tss__ipc_start_kappa(tss_ipc *p, const tss_ctx *c) {
             cc += g[a] * g[a], ce -= g[a] * c->g[a];
     double k = cc > 0 ? ce / cc / c->ah2 : 0;
     if (!(k > p->kappa_min)) k = p->kappa_min;
-    // What the last step had to raise is kept while pairs are still near, else it fades.
-    double kept = p->min_distance < 0.2 * p->dhat ? before : 0.5 * before;
-    if (kept > k) k = kept;
+    // A κ that changes from step to step changes forces at unchanged distances: resting bodies would be
+    // shaken (5 cm/s for a half-metre block) and slide at the limit of friction. So it stays unless
+    // it is four times too soft; sixteen times too hard, it fades while nothing is near.
+    int near_limit = p->min_distance < 0.2 * p->dhat;
+    if (before > 0 && k <= 4 * before) k = before <= 16 * k || near_limit ? before : 0.5 * before;
     if (k > p->kappa_max) k = p->kappa_max;
     if (c->quasistatic && before > k) k = before;
     p->kappa = k > 0 ? k : 1;
@@ -3959,7 +3966,7 @@ static int tss__ipc_double_kappa(tss_ipc *p, const tss_ctx *c) {
     }
     for (int i = 0; i < count; i++) closes += d[i] < limit;
     tss__ipc_array old = p->close;
-    memset(&p->close, 0, sizeof p->close);
+    p->close = p->close_old, p->close_old = old;
     tss__ipc_close *now =
         (tss__ipc_close *)tss__ipc_fit(p->host, &p->close, (size_t)closes * sizeof *now);
     if (!now) p->failed = 1;
@@ -3970,7 +3977,6 @@ static int tss__ipc_double_kappa(tss_ipc *p, const tss_ctx *c) {
             shrinks |= tss__ipc_shrinks((const tss__ipc_close *)old.p, p->closes, &now[k++]);
         }
     p->closes = now ? closes : 0;
-    tss__ipc_drop(p->host, &old);
     if (!shrinks || !(p->kappa < p->kappa_max)) return 0;
     p->kappa = 2 * p->kappa < p->kappa_max ? 2 * p->kappa : p->kappa_max;
     p->doubled++;
@@ -4252,9 +4258,13 @@ static tss_result tss__ipc_begin_step(void *user, const tss_ctx *c) {
     memcpy(p->x_start.p, c->x_t, bytes);
     r = tss__ipc_find_active(p, c, c->x_t, 0);
     if (r == TSS_OK) r = tss__ipc_hand_out(p, c, &p->active, &s);
-    if (r == TSS_OK) r = tss__ipc_start_kappa(p, c);
+    // The forces at x_t were held with the last step's κ: with a new one at the old distances λ would
+    // be wrong by the ratio of the two, and a block at the limit of friction would slide.
+    int first = !(p->kappa > 0);
+    if (r == TSS_OK && first) r = tss__ipc_start_kappa(p, c);
     if (r == TSS_OK) r = tss__ipc_lag(p, c, c->x_t);
     if (r == TSS_OK) r = tss__ipc_gather_touches(p, c, c->x_t, &p->touch, &p->touches);
+    if (r == TSS_OK && !first) r = tss__ipc_start_kappa(p, c);
     return r;
 }
 
@@ -4340,7 +4350,7 @@ static size_t tss__ipc_state(void *user, void *data, size_t size, int save) {
 
 static void tss__ipc_free(tss_ipc *p, const tss_host *host) {
     tss__ipc_array *all[] = {&p->kinematic, &p->self_off, &p->body_of,      &p->node,
-                             &p->node_old,  &p->x_active, &p->distance,     &p->close,
+                             &p->node_old,  &p->x_active, &p->distance,     &p->close, &p->close_old,
                              &p->work,      &p->f_node,   &p->f_data,       &p->f_key,
                              &p->x_start,   &p->touch,    &p->active.plane, &p->kept.plane};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) tss__ipc_drop(host, all[i]);
@@ -4683,7 +4693,7 @@ tss_result tss_ipc_remove(tss_ipc *p) {
 
 static size_t tss__ipc_bytes(const tss_ipc *p) {
     const tss__ipc_array *all[] = {&p->kinematic, &p->self_off, &p->body_of,      &p->node,
-                                   &p->node_old,  &p->x_active, &p->distance,     &p->close,
+                                   &p->node_old,  &p->x_active, &p->distance,     &p->close, &p->close_old,
                                    &p->work,      &p->f_node,   &p->f_data,       &p->f_key,
                                    &p->x_start,   &p->touch,    &p->active.plane, &p->kept.plane};
     size_t sum = sizeof *p;
@@ -4785,6 +4795,44 @@ tss_result tss_ipc_forces(tss_ipc *p, double *out) {
         tss__ipc_friction_gradient(p, &c, x, one, g);
         for (int k = 0; k < arity * c.dim; k++)
             if (v[k / c.dim] >= 0) out[v[k / c.dim] * c.dim + k % c.dim] -= g[k];
+    }
+    return TSS_OK;
+}
+
+// Twice the area (2D: the length) of a primitive of dim nodes at x.
+static double tss__ipc_measure_of(int dim, const double *x, const int *v) {
+    double u[3] = {0, 0, 0}, w[3] = {0, 0, 0}, n[3];
+    for (int a = 0; a < dim; a++) {
+        u[a] = x[v[1] * dim + a] - x[v[0] * dim + a];
+        if (dim == 3) w[a] = x[v[2] * dim + a] - x[v[0] * dim + a];
+    }
+    if (dim == 2) return 2 * sqrt(u[0] * u[0] + u[1] * u[1]);
+    n[0] = u[1] * w[2] - u[2] * w[1], n[1] = u[2] * w[0] - u[0] * w[2], n[2] = u[0] * w[1] - u[1] * w[0];
+    return sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+}
+
+tss_result tss_ipc_pressures(tss_ipc *p, double *out) {
+    tss_ctx c;
+    tss_stencils s;
+    tss_result r = tss__ipc_query(p, &c);
+    if (r == TSS_OK) r = tss__ipc_hand_out(p, &c, &p->active, &s);
+    if (r != TSS_OK) return r;
+    const double *x = tss_world_positions(p->world);
+    int dim = c.dim, items = dim == 3 ? p->surface.triangles : p->surface.edges;
+    const int *item = dim == 3 ? p->surface.triangle : p->surface.edge;
+    size_t n = (size_t)c.nodes, need = n * (size_t)dim * sizeof(double);
+    double *g = (double *)tss__ipc_fit(p->host, &p->work, need);
+    if (!g) return TSS_ERROR_NO_MEMORY;
+    memset(g, 0, need);
+    memset(out, 0, n * sizeof *out);
+    tss__ipc_sum_gradient(p, &c, x, p->kappa, g);
+    for (int k = 0; k < items; k++)
+        for (int i = 0; i < dim; i++)
+            out[item[k * dim + i]] += tss__ipc_measure_of(dim, x, item + k * dim) / (2 * dim);
+    for (int i = 0; i < c.nodes; i++) {
+        double f = 0;
+        for (int a = 0; a < dim; a++) f += g[i * dim + a] * g[i * dim + a];
+        out[i] = out[i] > 0 ? sqrt(f) / out[i] : 0;
     }
     return TSS_OK;
 }

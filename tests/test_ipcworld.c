@@ -226,9 +226,68 @@ static void test_slope(void **unused) {
     assert_true(moved[0] < 0.02);
 }
 
+// A block on a plane that is tilted slowly up to tan = 0.5. μ = 0.5 holds it: full friction, reached
+// at the smoothing's ε_v, equals the weight's part along the slope, so the few ε_v it crept at while
+// the plane still turned neither grow nor shrink. μ = 0.49 does not hold it: a = g (sin − 0.49 cos).
+static void test_slope_limit(void **unused) {
+    (void)unused;
+    const double sine = sin(atan(0.5)), cosine = cos(atan(0.5)), g = 9.81;
+    for (int run = 0; run < 2; run++) {
+        static block b;
+        const double origin[3] = {0, 0.008, 0}, mu = run ? 0.49 : 0.5;
+        tss_world *w;
+        tss_ipc *contact;
+        tss_ipc_info ipc;
+        tss_step_info info;
+        tss_world_def wd = tss_world_def_default();
+        wd.gravity[1] = -g, wd.tol = 1e-6, wd.integrator = TSS_IMPLICIT_EULER;
+        assert_int_equal(tss_world_create(&wd, &w), TSS_OK);
+        tss_body_def d = tss_body_def_default();
+        make_block(&b, 0.5, origin, 0);
+        d.nodes = NODES, d.X = b.X, d.cells = CELLS, d.cell = b.cell;
+        d.material.E = 1e7, d.material.damping = 0.01;
+        assert_int_equal(tss_body_add(w, &d, NULL), TSS_OK);
+        tss_ipc_plane plane = {{0, 0, 0}, {0, 1, 0}, mu};
+        tss_ipc_def id = tss_ipc_def_default();
+        id.planes = 1, id.plane = &plane, id.dhat = 0.01;
+        assert_int_equal(tss_ipc_add(w, &id, &contact), TSS_OK);
+        for (int i = 0; i < 300; i++) {
+            double angle = atan(0.5) * fmax(0, fmin(1, (i - 100) / 180.0));
+            double tilted[3] = {g * sin(angle), -g * cos(angle), 0};
+            assert_int_equal(tss_world_set_gravity(w, tilted), TSS_OK);
+            assert_int_equal(tss_world_step(w, NULL), TSS_OK);
+        }
+        double v = 0, before = 0;
+        for (int i = 0; i < NODES; i++) before += tss_world_velocities(w)[3 * i] / NODES;
+        for (int i = 0; i < 100; i++) {
+            assert_int_equal(tss_world_step(w, &info), TSS_OK);
+            assert_int_equal(info.status, TSS_STEP_CONVERGED);
+        }
+        double base = 0;  // the base alone: the rest also turns a little as the load moves downhill
+        for (int i = 0; i < NODES; i++) {
+            v += tss_world_velocities(w)[3 * i] / NODES;
+            if (b.X[3 * i + 1] == origin[1]) base += tss_world_velocities(w)[3 * i] / (GRID * GRID);
+        }
+        tss_ipc_get_info(contact, &ipc);
+        print_message("    mu %.2f: base %.3g m/s after 1 s, eps_v %.3g; all %.3g, free %.3g\n", mu, base,
+                      ipc.eps_v, v - before, g * (sine - mu * cosine));
+        if (run == 0) assert_true(fabs(v - before) < ipc.eps_v && base < 5 * ipc.eps_v);
+        double a = g * (sine - mu * cosine);
+        if (run == 1) assert_true(fabs(v - before - a) < 0.1 * a);
+        // Pressure on the ground: the weight's normal part over the base.
+        double pressure[NODES], most = 0;
+        assert_int_equal(tss_ipc_pressures(contact, pressure), TSS_OK);
+        for (int i = 0; i < NODES; i++) most = fmax(most, pressure[i]);
+        double mean = 1000 * 0.5 * g * cosine;
+        assert_true(most > 0.8 * mean && most < 4 * mean);
+        tss_world_destroy(w);
+    }
+}
+
 int main(void) {
     const struct CMUnitTest tests[] = {cmocka_unit_test(test_pile),
                                        cmocka_unit_test(test_energy_check),
-                                       cmocka_unit_test(test_resume), cmocka_unit_test(test_slope), cmocka_unit_test(test_bad_start)};
+                                       cmocka_unit_test(test_resume), cmocka_unit_test(test_slope), cmocka_unit_test(test_bad_start),
+                                       cmocka_unit_test(test_slope_limit)};
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
