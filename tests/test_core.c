@@ -469,6 +469,111 @@ static void test_checkpoint(void **state) {
     grid_free(&g);
 }
 
+// ---- the rest of the interface ----------------------------------------------------------------
+
+// Points carried by cells follow any affine motion exactly, also just outside the body.
+static void test_embedding(void **state) {
+    (void)state;
+    int n[3] = {3, 2, 2};
+    double L[3] = {1, 1, 1}, x[3 * 48];
+    static const double F[9] = {1.2, 0.1, 0, -0.1, 0.9, 0.2, 0.05, 0, 1.1};
+    grid g = grid_make(3, n, L);
+    tss_world *w = make_world(tss_world_def_default());
+    tss_body_def b = grid_body(&g);
+    add_body(w, &b);
+    const double p[9] = {0.31, 0.77, 0.5, 0.999, 0.001, 0.4, 1.05, 0.5, 0.5};
+    tss_embedding *e = NULL;
+    assert_int_equal(tss_embedding_create(w, 5, p, 3, &e), TSS_ERROR_NOT_FOUND);
+    assert_int_equal(tss_embedding_create(w, 0, p, 3, &e), TSS_OK);
+    for (int k = 0; k < 3 * g.nodes; k++) {
+        x[k] = 0.3 * (k % 3);
+        for (int c = 0; c < 3; c++) x[k] += F[k % 3 * 3 + c] * g.X[k / 3 * 3 + c];
+    }
+    assert_int_equal(tss_body_teleport(w, 0, x, NULL), TSS_OK);
+    float out[9];
+    tss_embedding_update(e, w, out);
+    for (int k = 0; k < 9; k++) {
+        double want = 0.3 * (k % 3);
+        for (int c = 0; c < 3; c++) want += F[k % 3 * 3 + c] * p[k / 3 * 3 + c];
+        near((double)out[k], want, 1e-6);
+    }
+    tss_world_destroy(w);
+    tss_embedding_destroy(e);  // may outlive its world
+    grid_free(&g);
+}
+
+// A body hung on a dragged node: at rest the spring is as long as its weight demands. A removed
+// body stays where it was, and the rest goes on.
+static void test_drag_and_remove(void **state) {
+    (void)state;
+    int n[3] = {2, 2, 2};
+    double L[3] = {0.1, 0.1, 0.1};
+    grid g = grid_make(3, n, L);
+    tss_world_def d = tss_world_def_default();
+    d.integrator = TSS_IMPLICIT_EULER;
+    tss_world *w = make_world(d);
+    tss_body_def b = grid_body(&g);
+    b.material.E = 1e6, b.material.damping = 0.05;
+    tss_body first = add_body(w, &b), second = add_body(w, &b);
+    double at[3] = {0.05, 0.1, 0.05};
+    int node = grid_id(n, 1, 2, 1);
+    assert_int_equal(tss_node_drag(w, node, at, -1), TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_node_drag(w, node, at, 200), TSS_OK);
+    assert_int_equal(tss_body_remove(w, second), TSS_OK);
+    assert_int_equal(tss_body_remove(w, second), TSS_ERROR_NOT_FOUND);
+    for (int s = 0; s < 400; s++) step(w);
+    near(at[1] - tss_world_positions(w)[3 * node + 1], 1 * 9.80665 / 200, 2e-3);  // 1 kg
+    tss_body_info info;
+    assert_int_equal(tss_body_get(w, second, &info), TSS_OK);
+    assert_true(info.removed);
+    for (int k = 0; k < 3 * g.nodes; k++)
+        assert_true(tss_world_positions(w)[3 * info.first_node + k] == g.X[k]);
+    double y = tss_world_positions(w)[3 * node + 1];
+    assert_int_equal(tss_node_drag(w, node, at, 0), TSS_OK);  // let go: it falls
+    for (int s = 0; s < 10; s++) step(w);
+    assert_true(tss_world_positions(w)[3 * node + 1] < y - 0.02);
+    (void)first;
+    tss_world_destroy(w);
+    grid_free(&g);
+}
+
+static double ticking(void *ctx) { return *(double *)ctx += 1e-3; }  // every look takes 1 ms
+
+// A budget stops a step early with a feasible state; a long one changes nothing.
+static void test_budget(void **state) {
+    (void)state;
+    int n[3] = {4, 2, 2};
+    double L[3] = {1, 0.5, 0.5}, now = 0;
+    grid g = grid_make(3, n, L);
+    tss_world_def d = tss_world_def_default();
+    d.tol = 1e-9, d.dt = 0.05;
+    tss_world *w = make_world(d);
+    assert_int_equal(tss_world_step_for(w, 1, NULL), TSS_ERROR_BAD_ARGUMENT);  // no clock
+    tss_world_destroy(w);
+    d.host.clock = ticking, d.host.clock_ctx = &now;
+    uint64_t hash[2];
+    for (int run = 0; run < 2; run++) {
+        w = make_world(d);
+        tss_body_def b = grid_body(&g);
+        add_body(w, &b);
+        for (int i = 0; i < g.nodes; i++)
+            if (g.X[3 * i] == 0) tss_node_pin(w, i, 7);
+        tss_step_info info;
+        for (int s = 0; s < 3; s++) {
+            if (run == 0) assert_int_equal(tss_world_step(w, &info), TSS_OK);
+            if (run == 1) assert_int_equal(tss_world_step_for(w, 1e6, &info), TSS_OK);
+            assert_int_equal(info.status, TSS_STEP_CONVERGED);
+        }
+        hash[run] = tss_world_hash(w);
+        assert_int_equal(tss_world_step_for(w, 8e-3, &info), TSS_OK);
+        assert_int_equal(info.status, TSS_STEP_BUDGET);
+        assert_true(info.newton >= 1 && info.min_J > 0);
+        tss_world_destroy(w);
+    }
+    assert_true(hash[0] == hash[1]);
+    grid_free(&g);
+}
+
 // ---- bad input --------------------------------------------------------------------------------
 
 static void expect_bad(const tss_body_def *d, tss_result want, const char *says) {
@@ -636,7 +741,9 @@ int main(void) {
         cmocka_unit_test(test_order),       cmocka_unit_test(test_patch),
         cmocka_unit_test(test_compression), cmocka_unit_test(test_cantilever),
         cmocka_unit_test(test_twist),       cmocka_unit_test(test_cloth),
-        cmocka_unit_test(test_bad_start),         cmocka_unit_test(test_same_bits),
+        cmocka_unit_test(test_bad_start),   cmocka_unit_test(test_embedding),
+        cmocka_unit_test(test_drag_and_remove), cmocka_unit_test(test_budget),
+              cmocka_unit_test(test_same_bits),
         cmocka_unit_test(test_checkpoint),  cmocka_unit_test(test_bad_bodies),
         cmocka_unit_test(test_bad_worlds),  cmocka_unit_test(test_millimetres),
         cmocka_unit_test(test_no_memory),
