@@ -30,8 +30,8 @@
  * Options, defined before the implementation:
  *     TSS_NO_OPENMP  no OpenMP even if the compiler has it on; saves libgomp. host.parallel_for
  *                    brings your own threads in either case.
- *     TSS_NO_METIS   a built-in ordering in place of METIS; saves the library, costs 1.2 to 1.5
- *                    times the arithmetic of a factorisation.
+ *     TSS_NO_METIS   a built-in ordering in place of METIS; saves the library, costs fill in the
+ *                    factor and so time.
  *     TSS_NO_SIMD    no intrinsics: plain loops. Slower factorisation (docs/performance.md).
  *     TSS_NO_LAPACK  accepted and without effect: the dense kernels are built in. Debian's serial
  *                    OpenBLAS returned wrong products when called from several threads at once,

@@ -1,4 +1,4 @@
-/* tss_ipc.h: contact and friction for tss.h, after Incremental Potential Contact (doc: see below)
+/* tss_ipc.h: contact and friction for tss.h, after Incremental Potential Contact
  *
  * What it is: surfaces of a world's bodies repel each other within a distance d̂ by a logarithmic
  * barrier, so strongly that they never meet; every Newton step is shortened by conservative
@@ -17,7 +17,7 @@
  * barrier and the collision detection below can be called on their own.
  *
  * Options: TSS_NO_SIMD  no intrinsics: plain loops, a slower search
- * Memory, threads, determinism, errors: as in tss.h. License: MIT (see the end of tss.h).
+ * Memory, threads, determinism, errors: as in tss.h. License: MIT (at the end).
  */
 #ifndef TSS_IPC_H
 #define TSS_IPC_H
