@@ -245,6 +245,10 @@ typedef struct tss_energy_def {
     // Smallest distance to the edge of the feasible set at x, m (contact: between surfaces; +inf
     // when nothing is near). Called at the end of a step.
     double (*clearance)(void *user, const tss_ctx *c, const double *x);
+    // What a subspace's oracle measures with (paper A, Eq. 5 and 8). For each node i of each cell:
+    // W[i] += smallest non-zero eigenvalue of the rest Hessian of the density, Pa; cells[i] += 1;
+    // v[i] += its share of the volume, m³; a[i] += the face opposite i, m² (in 2D m², m).
+    void (*node_scale)(void *user, const tss_ctx *c, double *W, double *cells, double *v, double *a);
     void (*destroy)(void *user, const tss_host *host);
     int cookie;
 } tss_energy_def;
@@ -516,6 +520,11 @@ TSS_API tss_result tss_chol_set_order(tss_chol *c, int n, int d, const int *orde
 // Column-major, lower triangle; the strict upper triangle is never used but may be overwritten.
 // ---------------------------------------------------------------------------------------------
 
+// C (m × n) = β C + α op(A) op(B), inner dimension k > 0, β 0 or 1; trans: op(A) = Aᵀ. Serial; safe to
+// call from several threads. An entry's sum runs over k in order.
+TSS_API void tss_dense_product(int trans_a, int trans_b, int m, int n, int k, double alpha,
+                               const double *a, int lda, const double *b, int ldb, double beta,
+                               double *c, int ldc);
 // A = L Lᵀ in place (n × n, leading dimension lda ≥ n). TSS_ERROR_SINGULAR and the failing column
 // in *bad (NULL allowed) when a pivot is ≤ 7e-15 · a_jj. n³/3 flops. bad: −1 on success.
 // Serial; safe to call from several threads on different matrices.
@@ -564,6 +573,8 @@ typedef struct tss_world_def {
     tss_linear linear;   // default TSS_LINEAR_AUTO
     double pcg_tol;      // relative residual of the linear solve; default 1e-5
     int pcg_iterations;  // bound on the iterations of one linear solve; default 10000
+    int newton_residual;  // 1: info.residual_newton is measured, at the cost of a full-space solve
+                          // a step; default 0
     // Every accepted iterate, also those of a step that does not converge; x_prev of the first is
     // the state before the step and the x_next of one call is the x_prev of the next. n × dim.
     void (*on_iterate)(const double *x_prev, const double *x_next, void *ctx);
@@ -689,7 +700,7 @@ TSS_API const char *tss_status_text(tss_status s);
 
 typedef enum tss_phase {
     TSS_PHASE_ENERGY, TSS_PHASE_GRADIENT, TSS_PHASE_HESSIAN, TSS_PHASE_ASSEMBLE,
-    TSS_PHASE_LINEAR, TSS_PHASE_COLLISION, TSS_PHASE_OTHER, TSS_PHASE_COUNT
+    TSS_PHASE_LINEAR, TSS_PHASE_COLLISION, TSS_PHASE_ORACLE, TSS_PHASE_OTHER, TSS_PHASE_COUNT
 } tss_phase;
 TSS_API const char *tss_phase_text(tss_phase p);
 
@@ -706,6 +717,8 @@ typedef struct tss_step_info {
     double residual_max;   // max_i ‖D_i⁻¹ ∇_{x_i}E‖/h, m/s; D_i the node's Hessian block
     double residual_mean;
     double decrement;      // ‖d‖∞/h of the last Newton direction, m/s
+    double residual_newton;  // ‖full-space Newton step‖∞/h at the end, m/s, with def.newton_residual
+    double oracle_error;   // largest 𝒢_i of a node that is not enriched (deformation, not error)
     double target_left;    // largest distance of a scripted node from its target, m
     double min_J;          // over all cells, at the end of the step
     double min_distance;   // between surfaces, m; +inf when nothing is near
@@ -748,6 +761,98 @@ TSS_API uint64_t tss_world_hash(const tss_world *w);
 // needed (data NULL: only that) or 0 on too small a size; load refuses anything that does not fit.
 TSS_API size_t tss_world_save(const tss_world *w, void *data, size_t size);
 TSS_API tss_result tss_world_load(tss_world *w, const void *data, size_t size);
+
+// ---------------------------------------------------------------------------------------------
+// >>directions (public)
+// Who finds the direction of a Newton iterate. Without a finder the world solves its full-space
+// system; tss_subspace.h plugs a finder in here, and so can you. The world keeps the loop: lists,
+// gradient, step filters, line search, convergence. The functions below marked "inside" may be
+// called from a finder's begin_step and direction only.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_iterate {
+    const tss_ctx *ctx;
+    int number;       // 0: the first of the step
+    const double *x;  // where it stands, n × d
+    const double *g;  // ∇E at x, n × d; 0 at fixed axes
+    int moves;        // kinematic nodes have a way to go: d holds their displacement
+    double tol;       // ‖d‖∞ that counts as converged, m
+    double *d;        // n × d, to be filled at the unknown nodes (0 there on entry)
+    int handled;      // out: 1: d is the direction; 0: the world solves in full space
+    int more;         // out: 1: not converged, however short d is
+} tss_iterate;
+
+typedef struct tss_direction_def {
+    const char *name;  // for messages; a string that outlives the world
+    void *user;
+    // All but direction may be NULL. w's current state is x at the start of the step.
+    tss_result (*begin_step)(void *user, tss_world *w, const tss_ctx *c);
+    tss_result (*direction)(void *user, tss_world *w, tss_iterate *it);
+    // After the line search took x0 → x1 = x0 + α·d.
+    void (*accepted)(void *user, const tss_ctx *c, const double *x0, const double *x1, double alpha);
+    // After the last iterate, before velocities are updated: may fill the counts in info.
+    tss_result (*end_step)(void *user, tss_world *w, const double *x, tss_step_info *info);
+    // Blocks of the Hessian's diagonal (unknown by unknown, d × d) for info.residual_max, of all
+    // energies that are not DYNAMIC. Returns 0 if the world's own matrix has them.
+    int (*diagonal)(void *user, const tss_ctx *c, double *D);
+    // What must survive a checkpoint, as in tss_energy_def.
+    size_t (*state)(void *user, void *data, size_t size, int save);
+    void (*destroy)(void *user, const tss_host *host);
+    int cookie;
+} tss_direction_def;
+
+TSS_API tss_direction_def tss_direction_def_default(void);
+// Sets the world's finder (def NULL: none); the one before is destroyed. Between steps only.
+TSS_API tss_result tss_world_set_direction(tss_world *w, const tss_direction_def *def);
+// The finder's def (NULL: none), owned by the world.
+TSS_API const tss_direction_def *tss_world_direction(const tss_world *w);
+
+// Unknown nodes. Owned by the world, valid until the next prepare.
+typedef struct tss_unknowns {
+    int rows;              // unknown nodes
+    const int *row;        // n: its number among them, −1 for a kinematic node
+    const int *node;       // rows
+    const uint8_t *fixed;  // rows × d: 1 for an axis that is pinned; NULL: none is
+} tss_unknowns;
+TSS_API void tss_world_unknowns(const tss_world *w, tss_unknowns *out);
+
+typedef struct tss_energy_view {
+    const char *name;
+    const tss_energy_def *def;
+    tss_stencils list;  // the one in use
+    double scale;       // αh² or 1
+    int inertia;        // 1: Σ m/2 ‖x − x̃‖², its Hessian is the lumped mass
+} tss_energy_view;
+// Energies have ids 0 .. count − 1; get returns NOT_FOUND where one was removed.
+TSS_API int tss_world_energies(const tss_world *w);
+TSS_API tss_result tss_energy_get(const tss_world *w, tss_energy e, tss_energy_view *out);
+
+// The world's matrices, one row an unknown node, patterns brought up to date with the lists in use
+// (inside). Fixed stencils add to A, DYNAMIC ones to C. Values are the caller's to clear and fill.
+TSS_API tss_result tss_world_matrices(tss_world *w, tss_bcsr *A, tss_bcsr *C);
+// Adds the projected Hessian of energy e at x to its matrix (inside). want: a byte a stencil, 0:
+// left out; NULL: all. d_k and rhs (rows × d), both or neither: rhs −= H_fk d_k for the moving
+// kinematic nodes.
+TSS_API tss_result tss_world_add_hessian(tss_world *w, tss_energy e, const double *x,
+                                         const uint8_t *want, const double *d_k, double *rhs);
+// All lists anew, for x + t·d with t ∈ [0, t_max], d NULL: for x alone (inside).
+TSS_API tss_result tss_world_list_along(tss_world *w, const double *x, const double *d, double t_max);
+// Largest t ≤ 1 that every energy's step filter allows from x along d; the lists then cover x + t·d
+// (inside). The same as the world does with the direction it is given.
+TSS_API tss_result tss_world_step_limit(tss_world *w, const double *x, const double *d, double *t);
+// ring[i] += E_i(x0) − E_i(x1), E_i the sum of the stencils that hold node i (paper A, Eq. 7), for
+// unknown nodes; *drop += E(x0) − E(x1). Over the lists in use (inside).
+TSS_API tss_result tss_world_ring_drop(tss_world *w, const double *x0, const double *x1,
+                                       double *ring, double *drop);
+// The full-space Newton direction at the iterate, into d (n × d; kinematic nodes as they are in d);
+// *ok 0 if the linear solve failed (inside). Changes the matrices.
+TSS_API tss_result tss_world_full_direction(tss_world *w, double *d, int *ok);
+// Adds the time since the last call to a phase.
+TSS_API void tss_world_clock_phase(tss_world *w, tss_phase p);
+
+// Lamé parameters (Pa) and density (kg/m³) of a body's cell; any of them may be NULL.
+TSS_API tss_result tss_body_cell_material(const tss_world *w, tss_body b, int cell, double *mu,
+                                          double *lambda, double *rho);
 
 // ---------------------------------------------------------------------------------------------
 // >>doctor (public)
@@ -2716,6 +2821,31 @@ static int tss__elastic_has_barrier(const tss__elastic *e) {
 }
 
 // The hook; the energy takes e over (destroy frees it).
+// Smallest non-zero eigenvalue of ∇²psi at rest: 2 mu (traceless stretches and shears). The face
+// opposite node i has d · volume · ‖∇N_i‖.
+static void tss__elastic_node_scale(void *user, const tss_ctx *c, double *W, double *cells, double *v,
+                                    double *a) {
+    const tss__elastic *e = (const tss__elastic *)user;
+    const int d = e->dim;
+    const double share = e->material.kind == TSS_STABLE_NEO_HOOKEAN ? 0.75 : 1;  // it stores 4/3 mu
+    (void)c;
+    for (int k = 0; k < e->cells; k++) {
+        const int b = k / TSS_LANES, l = k % TSS_LANES, *node = e->node + (size_t)k * (size_t)(d + 1);
+        tss__lanes *inv = e->inv + (size_t)b * (size_t)(d * d);
+        double vol = e->vol[b][l], mu = share * e->mu[e->per_cell ? b : 0][l], first[3] = {0, 0, 0};
+        for (int i = d; i >= 0; i--) {
+            double s = 0;
+            for (int r = 0; r < d; r++) {
+                double g = i > 0 ? inv[(i - 1) * d + r][l] : first[r];
+                first[r] -= g;
+                s += g * g;
+            }
+            W[node[i]] += 2 * mu, cells[node[i]] += 1;
+            v[node[i]] += vol / (d + 1), a[node[i]] += d * vol * sqrt(s);
+        }
+    }
+}
+
 static tss_energy_def tss__elastic_def(tss__elastic *e) {
     tss_energy_def d = tss_energy_def_default();
     d.name = "elasticity";
@@ -2732,6 +2862,7 @@ static tss_energy_def tss__elastic_def(tss__elastic *e) {
         d.max_step = tss__elastic_max_step;
     }
     d.describe = tss__elastic_describe;
+    d.node_scale = tss__elastic_node_scale;
     d.destroy = tss__elastic_destroy;
     return d;
 }
@@ -3959,6 +4090,11 @@ static void tss__gemm_nt(int m, int n, int k, double alpha, const double *a, int
 static void tss__gemm_nn(int m, int n, int k, double alpha, const double *a, int lda,
                          const double *b, int ldb, double beta, double *c, int ldc) {
     tss__gemm_any(m, n, k, alpha, a, 1, lda, b, ldb, 1, beta, c, ldc);
+}
+void tss_dense_product(int ta, int tb, int m, int n, int k, double alpha, const double *a, int lda,
+                       const double *b, int ldb, double beta, double *c, int ldc) {
+    if (m <= 0 || n <= 0 || k <= 0) return;
+    tss__gemm_any(m, n, k, alpha, a, ta ? lda : 1, ta ? 1 : lda, b, tb ? 1 : ldb, tb ? ldb : 1, beta, c, ldc);
 }
 // C = β C + α Aᵀ B; A k × m, B k × n.
 static void tss__gemm_tn(int m, int n, int k, double alpha, const double *a, int lda,
@@ -6720,6 +6856,8 @@ struct tss_world {
     tss_step_info info;
     double deadline;
     double phase_from;
+    tss_direction_def finder;  // direction NULL: none
+    int solved_full;           // the last iterate's direction is the world's own
 };
 
 #define TSS__BODY(w, b) (&((tss__bodydata *)(w)->bodies.p)[b])
@@ -6870,7 +7008,11 @@ typedef struct tss__pass {
     tss__matrix *m;
     double *scratch;
     size_t scratch_each;
+    const uint8_t *want;  // Hessian: stencils to add, or NULL for all
+    const double *x1;     // ring drop: where the energy is taken the second time
 } tss__pass;
+
+static int tss__id(tss_ids ids, int k) { return ids.list ? ids.list[k] : ids.first + k; }
 
 static tss_ids tss__block_ids(const tss_stencils *s, int b) {
     tss_ids ids;
@@ -6968,17 +7110,29 @@ static void tss__couple(const tss__pass *p, const double *H, int stride, int row
             p->rhs[row * dim + r] -= p->scale * H[r * stride + c] * p->d_k[node_b * dim + c];
 }
 
+// Those of a block that are wanted.
+static tss_ids tss__wanted(tss_ids ids, const uint8_t *want, int *chosen) {
+    int m = 0;
+    for (int k = 0; k < ids.count; k++)
+        if (want[ids.first + k]) chosen[m++] = ids.first + k;
+    if (m < ids.count) ids.list = chosen, ids.count = m;
+    return ids;
+}
+
 static void tss__hessian_task(int b, int worker, void *arg) {
     const tss__pass *p = (const tss__pass *)arg;
     const int A = p->e->def.arity, dim = p->w->dim, S = A * dim;
     double *out = p->scratch + (size_t)worker * p->scratch_each;
+    int chosen[TSS_BATCH];
     tss_ids ids = tss__block_ids(p->list, b);
+    if (p->want) ids = tss__wanted(ids, p->want, chosen);
+    if (ids.count == 0) return;
     p->e->def.hessian(p->e->def.user, &p->w->ctx, p->x, ids, 1, out);
-    const int *node = p->list->node + (size_t)ids.first * (size_t)A;
-    const int *slot = tss__i32(&p->e->slot) + (size_t)ids.first * (size_t)(A * A);
     const int *row = tss__i32(&p->w->row);
     double *val = tss__f64(&p->m->val);
-    for (int k = 0; k < ids.count; k++, node += A, slot += A * A, out += S * S)
+    for (int k = 0; k < ids.count; k++, out += S * S) {
+        const int *node = p->list->node + (size_t)tss__id(ids, k) * (size_t)A;
+        const int *slot = tss__i32(&p->e->slot) + (size_t)tss__id(ids, k) * (size_t)(A * A);
         for (int i = 0; i < A; i++) {
             if (node[i] < 0 || row[node[i]] < 0) continue;
             for (int j = 0; j < A; j++) {
@@ -6991,12 +7145,13 @@ static void tss__hessian_task(int b, int worker, void *arg) {
                     tss__couple(p, H, S, row[node[i]], node[j]);
             }
         }
+    }
 }
 
 // Adds an energy's projected Hessian at x to its matrix, and the pull of moving kinematic nodes
 // (displacement d_k, may be NULL) to the right-hand side.
-static tss_result tss__add_hessian(tss_world *w, tss__entry *e, const double *x, const double *d_k,
-                                   double *rhs) {
+static tss_result tss__add_hessian(tss_world *w, tss__entry *e, const double *x, const uint8_t *want,
+                                   const double *d_k, double *rhs) {
     size_t S = (size_t)(e->def.arity * w->dim);
     tss__pass p;
     memset(&p, 0, sizeof p);
@@ -7004,12 +7159,46 @@ static tss_result tss__add_hessian(tss_world *w, tss__entry *e, const double *x,
     p.scratch = (double *)tss__need(&w->host, &w->scratch,
                                     p.scratch_each * (size_t)tss_workers(&w->host), sizeof(double));
     if (!p.scratch) return tss__no_memory(w);
-    p.w = w, p.e = e, p.list = &e->list, p.x = x, p.d_k = d_k, p.rhs = rhs;
+    p.w = w, p.e = e, p.list = &e->list, p.x = x, p.want = want, p.d_k = d_k, p.rhs = rhs;
     p.scale = tss__scale(w, e);
     p.m = e->def.flags & TSS_ENERGY_DYNAMIC ? &w->C : &w->A;
     tss_result r = tss__plan_build(w, &e->plan, &e->list, e->def.arity);
     if (r != TSS_OK) return r;
     tss__plan_execute(&w->host, &e->plan, tss__hessian_task, &p);
+    return TSS_OK;
+}
+
+static void tss__drop_task(int b, int worker, void *arg) {
+    const tss__pass *p = (const tss__pass *)arg;
+    (void)worker;
+    double from[TSS_BATCH], to[TSS_BATCH], sum = 0;
+    int A = p->e->def.arity;
+    tss_ids ids = tss__block_ids(p->list, b);
+    p->e->def.value(p->e->def.user, &p->w->ctx, p->x, ids, from);
+    p->e->def.value(p->e->def.user, &p->w->ctx, p->x1, ids, to);
+    const int *node = p->list->node + (size_t)ids.first * (size_t)A;
+    for (int k = 0; k < ids.count; k++) {
+        double drop = p->scale * (from[k] - to[k]);
+        sum += drop;
+        for (int i = k * A; i < (k + 1) * A; i++)
+            if (node[i] >= 0 && tss__i32(&p->w->row)[node[i]] >= 0) p->out[node[i]] += drop;
+    }
+    p->rhs[b] = sum;
+}
+
+// Eq. (7), stencil by stencil, so that the difference does not drown in the sum.
+static tss_result tss__add_drop(tss_world *w, tss__entry *e, const double *x0, const double *x1,
+                                double *ring, double *drop) {
+    int blocks = (e->list.count + TSS_BATCH - 1) / TSS_BATCH;
+    tss_result r = tss__plan_build(w, &e->plan, &e->list, e->def.arity);
+    double *sum = (double *)tss__need(&w->host, &e->partial, (size_t)blocks * 2, sizeof(double));
+    if (r != TSS_OK || !sum) return r != TSS_OK ? r : tss__no_memory(w);
+    tss__pass p;
+    memset(&p, 0, sizeof p);
+    p.w = w, p.e = e, p.list = &e->list, p.x = x0, p.x1 = x1, p.out = ring, p.rhs = sum;
+    p.scale = tss__scale(w, e);
+    tss__plan_execute(&w->host, &e->plan, tss__drop_task, &p);
+    for (int b = 0; b < blocks; b++) *drop += sum[b];
     return TSS_OK;
 }
 
@@ -7836,7 +8025,6 @@ static tss_result tss__inertia_lists(void *user, const tss_ctx *c, const double 
     return TSS_OK;
 }
 
-static int tss__id(tss_ids ids, int k) { return ids.list ? ids.list[k] : ids.first + k; }
 
 static double tss__load(const tss_world *w, int node, int axis) {
     return tss__f64(&w->mass)[node] * w->def.gravity[axis] + tss__f64(&w->force)[node * w->dim + axis];
@@ -8354,6 +8542,7 @@ static void tss__entry_free(const tss_host *h, tss__entry *e) {
 void tss_world_destroy(tss_world *w) {
     if (!w) return;
     const tss_host *h = &w->host;
+    if (w->finder.destroy) w->finder.destroy(w->finder.user, h);
     for (int k = 0; k < w->elastic_count; k++) {  // damping before the elasticity it reads
         tss_energy e = ((tss__elastic_ref *)w->elastics.p)[k].damping;
         if (e >= 0) tss_energy_remove(w, e);
@@ -8399,7 +8588,7 @@ const char *tss_status_text(tss_status s) {
 
 const char *tss_phase_text(tss_phase p) {
     static const char *const text[] = {"energy", "gradient", "hessian", "assemble",
-                                       "linear", "collision", "other"};
+                                       "linear", "collision", "oracle", "other"};
     return (unsigned)p < TSS_PHASE_COUNT ? text[p] : "unknown";
 }
 
@@ -8549,6 +8738,8 @@ tss_result tss_world_prepare(tss_world *w) {
 // it is a plain descent. θ < 1 shortens the prescribed motion while the filters cut steps short.
 // ---------------------------------------------------------------------------------------------
 
+#define TSS__LIMIT_TEXT 128
+
 typedef struct tss__iter {
     double E, size;      // energy at x_k and the magnitude of its terms
     int E_known;
@@ -8557,9 +8748,10 @@ typedef struct tss__iter {
     double dnorm;        // ‖d‖∞ over the unknowns
     double t_max;        // what the step filters allow
     double alpha;        // accepted
-    char limit[128];     // who limited the step
+    char limit[TSS__LIMIT_TEXT];  // who limited the step
     double tol;          // ‖d‖∞ that counts as converged
     int small_steps;     // iterates in a row with tiny steps
+    int more;            // the finder has something to add: not converged
 } tss__iter;
 
 static double tss__dot_blocks(const double *a, const double *b, int count) {
@@ -8632,16 +8824,13 @@ static int tss__kinematic_direction(tss_world *w, const tss__iter *it) {
     return 1;
 }
 
-// Matrices, right-hand side and the direction d of this iterate.
-static tss_result tss__direction(tss_world *w, tss__iter *it, tss_status *failed) {
-    double *g = tss__f64(&w->g), *d = tss__f64(&w->d), *rhs = tss__f64(&w->rhs), *y = tss__f64(&w->sys_d);
-    const double *x = tss__f64(&w->x_k);
+// The full-space Newton direction at x from the gradient g, into d.
+static tss_result tss__full_direction(tss_world *w, const double *x, const double *g, int moves, double *d,
+                                      tss_status *failed) {
+    double *rhs = tss__f64(&w->rhs), *y = tss__f64(&w->sys_d);
     const int *node = tss__i32(&w->node_of_row);
-    int dim = w->dim, moves = tss__kinematic_direction(w, it);
-    tss_result r = tss__gradient_at(w, x, g, 1);
-    if (r != TSS_OK) return r;
-    tss__phase(w, TSS_PHASE_GRADIENT);
-    r = tss__pattern_update(w, 0);
+    int dim = w->dim;
+    tss_result r = tss__pattern_update(w, 0);
     if (r == TSS_OK) r = tss__pattern_update(w, 1);
     if (r != TSS_OK) return r;
     w->matrix_valid = 1;
@@ -8653,41 +8842,63 @@ static tss_result tss__direction(tss_world *w, tss__iter *it, tss_status *failed
     for (int k = 0; k < w->entry_count; k++) {
         tss__entry *e = TSS__ENTRY(w, k);
         if (!e->live || e->list.count == 0) continue;
-        if ((r = tss__add_hessian(w, e, x, moves ? d : NULL, rhs)) != TSS_OK) return r;
+        if ((r = tss__add_hessian(w, e, x, NULL, moves ? d : NULL, rhs)) != TSS_OK) return r;
     }
     for (int k = 0; k < w->rows * dim; k++)
         if (tss__u8(&w->mask)[k]) rhs[k] = 0;
     tss__phase(w, TSS_PHASE_HESSIAN);
     r = tss__linear_solve(w, rhs, y, failed);
     if (r != TSS_OK || *failed != TSS_STEP_CONVERGED) return r;
-    it->dnorm = 0;
     for (int k = 0; k < w->rows; k++)
-        for (int c = 0; c < dim; c++) {
-            d[node[k] * dim + c] = y[k * dim + c];
-            it->dnorm = tss__max(it->dnorm, fabs(y[k * dim + c]));
-        }
-    it->gd = tss__dot_blocks(g, d, w->n * dim);
+        for (int c = 0; c < dim; c++) d[node[k] * dim + c] = y[k * dim + c];
     tss__phase(w, TSS_PHASE_LINEAR);
     return TSS_OK;
 }
 
+// The gradient and the direction d of this iterate, the finder's or the full-space one.
+static tss_result tss__direction(tss_world *w, tss__iter *it, tss_status *failed) {
+    double *g = tss__f64(&w->g), *d = tss__f64(&w->d);
+    const double *x = tss__f64(&w->x_k);
+    int moves = tss__kinematic_direction(w, it);
+    tss_result r = tss__gradient_at(w, x, g, 1);
+    if (r != TSS_OK) return r;
+    tss__phase(w, TSS_PHASE_GRADIENT);
+    it->more = 0, w->solved_full = 1;
+    if (w->finder.direction) {
+        tss_iterate v;
+        memset(&v, 0, sizeof v);
+        v.ctx = &w->ctx, v.number = w->info.newton, v.x = x, v.g = g, v.d = d, v.moves = moves, v.tol = it->tol;
+        r = w->finder.direction(w->finder.user, w, &v);
+        if (r != TSS_OK) return r;
+        it->more = v.more, w->solved_full = !v.handled;
+        tss__phase(w, TSS_PHASE_LINEAR);
+    }
+    if (w->solved_full) r = tss__full_direction(w, x, g, moves, d, failed);
+    if (r != TSS_OK || *failed != TSS_STEP_CONVERGED) return r;
+    it->dnorm = 0;
+    for (int k = 0; k < w->rows; k++)
+        for (int c = 0; c < w->dim; c++)
+            it->dnorm = tss__max(it->dnorm, fabs(d[tss__i32(&w->node_of_row)[k] * w->dim + c]));
+    it->gd = tss__dot_blocks(g, d, w->n * w->dim);
+    return TSS_OK;
+}
+
 // The step filters: fixed stencils first (cheap), then lists along the shortened sweep.
-static tss_result tss__filter(tss_world *w, tss__iter *it) {
-    const double *x = tss__f64(&w->x_k), *d = tss__f64(&w->d);
-    it->t_max = 1;
+static tss_result tss__filter(tss_world *w, const double *x, const double *d, double *t_max, char *limit) {
+    *t_max = 1;
     for (int dynamic = 0; dynamic < 2; dynamic++) {
         if (dynamic) {
-            tss_result r = tss__lists(w, 1, x, d, it->t_max);
+            tss_result r = tss__lists(w, 1, x, d, *t_max);
             if (r != TSS_OK) return r;
         }
         for (int k = 0; k < w->entry_count; k++) {
             tss__entry *e = TSS__ENTRY(w, k);
             if (!tss__in_matrix(e, dynamic) || !e->def.max_step) continue;
             int culprit = -1;
-            double t = e->def.max_step(e->def.user, &w->ctx, x, d, it->t_max, &culprit);
-            if (t >= it->t_max) continue;
-            it->t_max = tss__max(t, 0);
-            tss__describe(w, e, culprit, it->limit, sizeof it->limit);
+            double t = e->def.max_step(e->def.user, &w->ctx, x, d, *t_max, &culprit);
+            if (t >= *t_max) continue;
+            *t_max = tss__max(t, 0);
+            if (limit) tss__describe(w, e, culprit, limit, TSS__LIMIT_TEXT);
         }
     }
     return TSS_OK;
@@ -8935,7 +9146,7 @@ static tss_result tss__begin_step(tss_world *w) {
         }
     }
     w->ctx.g = NULL;
-    return TSS_OK;
+    return w->finder.begin_step ? w->finder.begin_step(w->finder.user, w, &w->ctx) : TSS_OK;
 }
 
 static void tss__accept(tss_world *w, tss__iter *it) {
@@ -8949,6 +9160,7 @@ static void tss__accept(tss_world *w, tss__iter *it) {
         if (e->live && e->def.after_iterate)
             changed |= e->def.after_iterate(e->def.user, &w->ctx, x, y);
     }
+    if (w->finder.accepted) w->finder.accepted(w->finder.user, &w->ctx, x, y, it->alpha);
     memcpy(x, y, bytes);
     if (changed) it->E_known = 0;
     w->info.min_alpha = tss__min(w->info.min_alpha, it->alpha);
@@ -8990,13 +9202,14 @@ static tss_result tss__solve(tss_world *w, tss__iter *it) {
         w->info.newton++;
         w->info.decrement = it->dnorm / w->def.dt;
         snprintf(it->limit, sizeof it->limit, "nothing");
-        if ((r = tss__filter(w, it)) != TSS_OK) return r;
+        r = tss__filter(w, tss__f64(&w->x_k), tss__f64(&w->d), &it->t_max, it->limit);
+        if (r != TSS_OK) return r;
         tss__phase(w, TSS_PHASE_COLLISION);
         int found = 0, was_moving = it->s > 0;
         if ((r = tss__line_search(w, it, &found)) != TSS_OK) return r;
         tss__phase(w, TSS_PHASE_ENERGY);
         if (!found) {
-            if (it->dnorm <= tol && it->s == 0) return TSS_OK;  // at the noise floor, and close enough
+            if (it->dnorm <= tol && it->s == 0 && !it->more) return TSS_OK;  // noise floor, close enough
             if (was_moving && it->theta > 1e-4) {  // the prescribed motion was too bold
                 it->theta = tss__max(it->theta * 0.25, 1e-4);
                 it->E_known = 0;
@@ -9008,7 +9221,7 @@ static tss_result tss__solve(tss_world *w, tss__iter *it) {
         }
         tss__accept(w, it);
         if (was_moving) tss__adapt_theta(it);
-        if (it->dnorm <= tol && it->s == 0) return TSS_OK;
+        if (it->dnorm <= tol && it->s == 0 && !it->more) return TSS_OK;
         it->small_steps = it->alpha * tss__max(it->dnorm, 0) < 1e-8 * tol && !was_moving ? it->small_steps + 1 : 0;
         if (it->small_steps >= 10) {  // ten steps a hundred-millionth of the tolerance long
             tss__stop(w, TSS_STEP_STALLED, "steps limited to %.3g by %s", it->alpha, it->limit);
@@ -9046,7 +9259,8 @@ static tss_result tss__measure_residual(tss_world *w) {
     tss_result r = tss__lists(w, 0, tss__f64(&w->x_k), NULL, 0);
     if (r == TSS_OK) r = tss__gradient_at(w, tss__f64(&w->x_k), g, 1);
     if (r != TSS_OK) return r;
-    tss_bcsr_diagonal(&w->host, &w->A.m, D, 0);
+    if (w->solved_full || !w->finder.diagonal || !w->finder.diagonal(w->finder.user, &w->ctx, D))
+        tss_bcsr_diagonal(&w->host, &w->A.m, D, 0);
     tss_bcsr_diagonal(&w->host, &w->C.m, D, 1);
     for (int k = 0; k < w->rows; k++) {
         double e = tss__node_residual(D + k * w->dim * w->dim,
@@ -9057,9 +9271,21 @@ static tss_result tss__measure_residual(tss_world *w) {
     return TSS_OK;
 }
 
+// ‖full-space Newton step‖∞/h at the accepted state.
+static tss_result tss__newton_residual(tss_world *w) {
+    tss_status failed = TSS_STEP_CONVERGED;
+    double *d = tss__f64(&w->d), most = 0;
+    memset(d, 0, (size_t)(w->n * w->dim) * sizeof(double));
+    tss_result r = tss__full_direction(w, tss__f64(&w->x_k), tss__f64(&w->g), 0, d, &failed);
+    for (int k = 0; k < w->n * w->dim; k++) most = tss__max(most, fabs(d[k]));
+    w->info.residual_newton = failed == TSS_STEP_CONVERGED ? most / w->def.dt : INFINITY;
+    return r;
+}
+
 static tss_result tss__finish(tss_world *w, int full) {
     tss_result r = full && w->info.newton > 0 ? tss__measure_residual(w) : TSS_OK;
     tss_step_info *s = &w->info;
+    if (r == TSS_OK && full && w->def.newton_residual && s->newton > 0) r = tss__newton_residual(w);
     s->target_left = tss__target_left(w, tss__f64(&w->x_k));
     s->nodes = s->enriched_nodes = w->rows;
     s->min_distance = INFINITY, s->contacts = 0;
@@ -9072,6 +9298,8 @@ static tss_result tss__finish(tss_world *w, int full) {
                                        e->def.clearance(e->def.user, &w->ctx, tss__f64(&w->x_k)));
     }
     if (full) s->min_J = tss__min_J(w, tss__f64(&w->x_k));
+    if (r == TSS_OK && w->finder.end_step)
+        r = w->finder.end_step(w->finder.user, w, tss__f64(&w->x_k), s);
     return r;
 }
 
@@ -9126,6 +9354,102 @@ tss_result tss_world_step_for(tss_world *w, double seconds, tss_step_info *info)
         return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "step_for: %g s, expected > 0 and a clock in the host",
                          seconds);
     return tss__take_step(w, seconds, info);
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>directions (private)
+// What a direction finder may ask of the world: thin doors to the sections above.
+// ---------------------------------------------------------------------------------------------
+
+tss_direction_def tss_direction_def_default(void) {
+    tss_direction_def d;
+    memset(&d, 0, sizeof d);
+    d.cookie = TSS__COOKIE;
+    return d;
+}
+
+tss_result tss_world_set_direction(tss_world *w, const tss_direction_def *def) {
+    if (!w) return TSS_ERROR_BAD_ARGUMENT;
+    if (def && (def->cookie != TSS__COOKIE || !def->direction))
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT,
+                              "direction: start from tss_direction_def_default() and set direction");
+    if (w->finder.destroy) w->finder.destroy(w->finder.user, &w->host);
+    memset(&w->finder, 0, sizeof w->finder);
+    if (def) w->finder = *def;
+    return TSS_OK;
+}
+
+const tss_direction_def *tss_world_direction(const tss_world *w) {
+    return w->finder.direction ? &w->finder : NULL;
+}
+
+void tss_world_unknowns(const tss_world *w, tss_unknowns *out) {
+    out->rows = w->rows, out->row = tss__i32(&w->row), out->node = tss__i32(&w->node_of_row);
+    out->fixed = w->masked ? tss__u8(&w->mask) : NULL;
+}
+
+int tss_world_energies(const tss_world *w) { return w->entry_count; }
+
+tss_result tss_energy_get(const tss_world *w, tss_energy id, tss_energy_view *out) {
+    if (!w || !out) return TSS_ERROR_BAD_ARGUMENT;
+    if (id < 0 || id >= w->entry_count || !TSS__ENTRY(w, id)->live) return TSS_ERROR_NOT_FOUND;
+    const tss__entry *e = TSS__ENTRY(w, id);
+    out->name = e->name, out->def = &e->def, out->list = e->list, out->scale = tss__scale(w, e);
+    out->inertia = id == w->inertia_energy;
+    return TSS_OK;
+}
+
+tss_result tss_world_matrices(tss_world *w, tss_bcsr *A, tss_bcsr *C) {
+    tss_result r = tss__pattern_update(w, 0);
+    if (r == TSS_OK) r = tss__pattern_update(w, 1);
+    if (r != TSS_OK) return r;
+    w->matrix_valid = 1;
+    *A = w->A.m, *C = w->C.m;
+    return TSS_OK;
+}
+
+tss_result tss_world_add_hessian(tss_world *w, tss_energy id, const double *x, const uint8_t *want,
+                                 const double *d_k, double *rhs) {
+    tss__entry *e = TSS__ENTRY(w, id);
+    return e->list.count == 0 ? TSS_OK : tss__add_hessian(w, e, x, want, d_k, rhs);
+}
+
+tss_result tss_world_list_along(tss_world *w, const double *x, const double *d, double t_max) {
+    return tss__lists(w, 0, x, d, t_max);
+}
+
+tss_result tss_world_step_limit(tss_world *w, const double *x, const double *d, double *t) {
+    return tss__filter(w, x, d, t, NULL);
+}
+
+tss_result tss_world_ring_drop(tss_world *w, const double *x0, const double *x1, double *ring,
+                               double *drop) {
+    tss_result r = TSS_OK;
+    for (int k = 0; k < w->entry_count && r == TSS_OK; k++) {
+        tss__entry *e = TSS__ENTRY(w, k);
+        if (e->live && e->list.count > 0) r = tss__add_drop(w, e, x0, x1, ring, drop);
+    }
+    return r;
+}
+
+tss_result tss_world_full_direction(tss_world *w, double *d, int *ok) {
+    tss_status failed = TSS_STEP_CONVERGED;
+    tss_result r = tss__full_direction(w, tss__f64(&w->x_k), tss__f64(&w->g), 1, d, &failed);
+    *ok = r == TSS_OK && failed == TSS_STEP_CONVERGED;
+    return r;
+}
+
+void tss_world_clock_phase(tss_world *w, tss_phase p) { tss__phase(w, p); }
+
+tss_result tss_body_cell_material(const tss_world *w, tss_body id, int cell, double *mu, double *lambda,
+                                  double *rho) {
+    if (!w || id < 0 || id >= w->body_count) return TSS_ERROR_BAD_ARGUMENT;
+    const tss__bodydata *b = TSS__BODY(w, id);
+    if (cell < 0 || cell >= b->cells) return TSS_ERROR_BAD_ARGUMENT;
+    tss_lame(b->E.p ? tss__f64(&b->E)[cell] : b->material.E, b->nu.p ? tss__f64(&b->nu)[cell] : b->material.nu,
+             mu, lambda);
+    if (rho) *rho = b->rho.p ? tss__f64(&b->rho)[cell] : b->material.rho;
+    return TSS_OK;
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -9207,9 +9531,17 @@ static size_t tss__copy_drags(const tss_world *w, char *at, int drags, int save)
     return all;
 }
 
-static size_t tss__energy_state(const tss_world *w, const tss__entry *e, void *data, size_t size, int save) {
-    (void)w;
+// Part k: energy k, or after the last of them the direction finder.
+static size_t tss__part_state(const tss_world *w, int k, void *data, size_t size, int save) {
+    if (k == w->entry_count)
+        return w->finder.state ? w->finder.state(w->finder.user, data, size, save) : 0;
+    const tss__entry *e = TSS__ENTRY(w, k);
     return e->live && e->def.state ? e->def.state(e->def.user, data, size, save) : 0;
+}
+
+static int tss__part_has_state(const tss_world *w, int k) {
+    if (k == w->entry_count) return w->finder.state != NULL;
+    return TSS__ENTRY(w, k)->live && TSS__ENTRY(w, k)->def.state != NULL;
 }
 
 size_t tss_world_save(const tss_world *w, void *data, size_t size) {
@@ -9219,13 +9551,12 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     for (int k = 0; k < count; k++) need += bytes[k];
     int order = w->chol ? tss_chol_get_order(w->chol, NULL, NULL) : 0;
     need += (size_t)order * sizeof(int) + (size_t)w->drags * tss__drag_bytes(w);
-    for (int k = 0; k < w->entry_count; k++)
-        need += sizeof(uint64_t) + tss__energy_state(w, TSS__ENTRY(w, k), NULL, 0, 1);
+    for (int k = 0; k <= w->entry_count; k++) need += sizeof(uint64_t) + tss__part_state(w, k, NULL, 0, 1);
     if (!data) return need;
     if (size < need) return 0;
     tss__head h;
     memset(&h, 0, sizeof h);
-    h.magic = TSS__MAGIC, h.version = 1, h.dim = (uint64_t)w->dim, h.n = (uint64_t)w->n;
+    h.magic = TSS__MAGIC, h.version = 2, h.dim = (uint64_t)w->dim, h.n = (uint64_t)w->n;
     h.energies = (uint64_t)w->entry_count, h.steps = w->steps, h.history = w->history;
     h.time = w->time, h.ah2 = w->ctx.ah2, h.dt = w->def.dt;
     h.pcg_iterations = w->pcg_iterations, h.pcg_rest = w->pcg_rest;
@@ -9238,25 +9569,23 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     if (order > 0) tss_chol_get_order(w->chol, (int *)(void *)to, NULL);
     to += (size_t)order * sizeof(int);
     to += tss__copy_drags(w, to, w->drags, 1);
-    for (int k = 0; k < w->entry_count; k++) {
-        uint64_t len = tss__energy_state(w, TSS__ENTRY(w, k), NULL, 0, 1);
+    for (int k = 0; k <= w->entry_count; k++) {
+        uint64_t len = tss__part_state(w, k, NULL, 0, 1);
         memcpy(to, &len, sizeof len), to += sizeof len;
-        tss__energy_state(w, TSS__ENTRY(w, k), to, (size_t)len, 1), to += len;
+        tss__part_state(w, k, to, (size_t)len, 1), to += len;
     }
     return need;
 }
 
-// Walks the energies' parts: restore 0 only measures. Returns 0 where something does not fit.
+// Walks the parts of energies and finder: restore 0 only measures. 0 where something does not fit.
 static int tss__load_energies(tss_world *w, const char *from, size_t left, int restore) {
-    for (int k = 0; k < w->entry_count; k++) {
+    for (int k = 0; k <= w->entry_count; k++) {
         uint64_t len;
         if (left < sizeof len) return 0;
         memcpy(&len, from, sizeof len), from += sizeof len, left -= sizeof len;
         if (len > left) return 0;
-        tss__entry *e = TSS__ENTRY(w, k);
-        if (len > 0 && (!e->live || !e->def.state)) return 0;
-        if (restore && len > 0 && e->def.state(e->def.user, (void *)(uintptr_t)from, (size_t)len, 0) != len)
-            return 0;
+        if (len > 0 && !tss__part_has_state(w, k)) return 0;
+        if (restore && len > 0 && tss__part_state(w, k, (void *)(uintptr_t)from, (size_t)len, 0) != len) return 0;
         from += len, left -= (size_t)len;
     }
     return left == 0;
@@ -9286,7 +9615,7 @@ tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
     for (int k = 0; k < count; k++) fixed += bytes[k];
     if (size < sizeof h) return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %zu bytes are too few", size);
     memcpy(&h, data, sizeof h);
-    if (h.magic != TSS__MAGIC || h.version != 1)
+    if (h.magic != TSS__MAGIC || h.version != 2)
         return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: not one of this version");
     if (h.dim != (uint64_t)w->dim || h.n != (uint64_t)w->n || h.energies != (uint64_t)w->entry_count)
         return tss_world_fail(w, TSS_ERROR_MISMATCH,
