@@ -847,8 +847,14 @@ TSS_API tss_result tss_world_ring_drop(tss_world *w, const double *x0, const dou
 // The full-space Newton direction at the iterate, into d (n × d; kinematic nodes as they are in d);
 // *ok 0 if the linear solve failed (inside). Changes the matrices.
 TSS_API tss_result tss_world_full_direction(tss_world *w, double *d, int *ok);
+// Asks the finder for the first direction of the step to come, and takes no step: nothing changes.
+TSS_API tss_result tss_world_probe(tss_world *w);
 // Adds the time since the last call to a phase.
 TSS_API void tss_world_clock_phase(tss_world *w, tss_phase p);
+
+// Takes x, v, the integrator's memory, time, targets and what energies remember from a world built by the same
+// calls (contact stiffness, lagged friction); direction finder and linear solver stay as they are.
+TSS_API tss_result tss_world_copy_state(tss_world *to, const tss_world *from);
 
 // Lamé parameters (Pa) and density (kg/m³) of a body's cell; any of them may be NULL.
 TSS_API tss_result tss_body_cell_material(const tss_world *w, tss_body b, int cell, double *mu,
@@ -9439,6 +9445,33 @@ tss_result tss_world_full_direction(tss_world *w, double *d, int *ok) {
     return r;
 }
 
+static tss_result tss__probe_step(tss_world *w) {
+    tss__iter it;
+    tss_status failed = TSS_STEP_CONVERGED;
+    memset(&it, 0, sizeof it);
+    it.s = tss__find_moving(w) ? 1 : 0, it.theta = 1, it.tol = tss__tolerance(w);
+    tss_result r = tss__begin_step(w);
+    if (r == TSS_OK) r = tss__lists(w, 0, tss__f64(&w->x_k), NULL, 0);
+    return r == TSS_OK ? tss__direction(w, &it, &failed) : r;
+}
+
+tss_result tss_world_probe(tss_world *w) {
+    if (!w) return TSS_ERROR_BAD_ARGUMENT;
+    tss_result r = tss_world_prepare(w);
+    if (r != TSS_OK) return r;
+    size_t bytes = tss_world_save(w, NULL, 0);
+    void *state = tss_alloc(&w->host, bytes);
+    if (!state) return tss__no_memory(w);
+    tss_world_save(w, state, bytes);
+    tss_step_info info = w->info;
+    memset(&w->info, 0, sizeof w->info);
+    r = tss__probe_step(w);
+    tss_result back = tss_world_load(w, state, bytes);
+    tss_free(&w->host, state, bytes);
+    w->info = info;
+    return r != TSS_OK ? r : back;
+}
+
 void tss_world_clock_phase(tss_world *w, tss_phase p) { tss__phase(w, p); }
 
 tss_result tss_body_cell_material(const tss_world *w, tss_body id, int cell, double *mu, double *lambda,
@@ -9649,6 +9682,41 @@ tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
     tss__fill_ctx(w);
     if (!tss__load_energies(w, (const char *)data + fixed, size - fixed, 1))
         return tss_world_fail(w, TSS_ERROR_MISMATCH, "checkpoint: an energy refused its state");
+    return TSS_OK;
+}
+
+// The states of all energies, one after the other, through a buffer.
+static tss_result tss__copy_energies(tss_world *to, const tss_world *from) {
+    for (int k = 0; k < to->entry_count; k++) {
+        size_t bytes = tss__part_state(from, k, NULL, 0, 1);
+        if (bytes == 0) continue;
+        void *data = tss__need(&to->host, &to->scratch, bytes, 1);
+        if (!data) return tss__no_memory(to);
+        tss__part_state(from, k, data, bytes, 1);
+        if (!tss__part_has_state(to, k) || tss__part_state(to, k, data, bytes, 0) != bytes)
+            return tss_world_fail(to, TSS_ERROR_MISMATCH, "copy_state: energy %d is another one there", k);
+    }
+    return TSS_OK;
+}
+
+tss_result tss_world_copy_state(tss_world *to, const tss_world *from) {
+    const tss__buf *out[9], *in[9];
+    size_t bytes[9];
+    if (!to || !from) return TSS_ERROR_BAD_ARGUMENT;
+    tss_result r = tss_world_prepare(to);
+    if (r != TSS_OK) return r;
+    if (!from->prepared || to->n != from->n || to->dim != from->dim || to->entry_count != from->entry_count)
+        return tss_world_fail(to, TSS_ERROR_MISMATCH, "copy_state: the worlds were not built by the same calls");
+    int count = tss__saved(to, out, bytes);
+    tss__saved(from, in, bytes);
+    if (memcmp(out[7]->p, in[7]->p, bytes[7]) || memcmp(out[8]->p, in[8]->p, bytes[8]))
+        return tss_world_fail(to, TSS_ERROR_MISMATCH, "copy_state: other nodes are pinned or scripted there");
+    if ((r = tss__copy_energies(to, from)) != TSS_OK) return r;
+    for (int k = 0; k < count; k++) memcpy(out[k]->p, in[k]->p, bytes[k]);
+    to->steps = from->steps, to->history = from->history, to->time = from->time;
+    to->ctx.ah2 = from->ctx.ah2, to->def.dt = from->def.dt, to->def.tol = from->def.tol;
+    memcpy(to->def.gravity, from->def.gravity, sizeof to->def.gravity);
+    tss__fill_ctx(to);
     return TSS_OK;
 }
 
