@@ -2353,6 +2353,7 @@ typedef struct tss__sub_basis {  // a basis of a body
     tss_basis_def def;
     tss__basis b;
     tss__sub_buf on;             // int: active blocks, ascending
+    tss__sub_buf transposed;     // their transforms, if the basis is factored
     int on_count;
     double seconds;
     double *columns;             // CUSTOM: scratch handed to refresh
@@ -2481,6 +2482,7 @@ struct tss_subspace {
     const tss_ctx *ctx;                                  // the world's
     tss__sub_buf dq;                                     // d_q of the last iterate, and room
     tss__sub_buf dyn_ptr, dyn_id;                        // node → stencils that change (entry, id)
+    tss__sub_buf activate;                               // by group: the oracle's answer
     tss__sub_buf pending;                                // from a checkpoint, until groups exist
     int pending_n, pending_groups;
 };
@@ -3045,6 +3047,27 @@ static const double *tss__sub_X(const tss_subspace *s, const tss__modal *m) {
     return tss_world_rest(s->w) + (size_t)m->first * (size_t)s->dim;
 }
 
+// Rows of a factored basis: w_h (T_hᵀ m), four functions at a time in 3D.
+static void tss__sub_phi_factored(const tss_subspace *s, const tss__sub_basis *b, const double *X, const int *node,
+                                  int count, double *phi, int ld) {
+    const int q = s->dim + 1;
+    const double *T = tss__sub_f(&b->transposed);
+    for (int i = 0; i < count; i++, phi += ld) {
+        double m[4] = {1, 0, 0, 0};
+        for (int a = 0; a < s->dim; a++) m[a + 1] = X[node[i] * s->dim + a] - b->b.center[a];
+        const double *w = b->b.weight + (size_t)node[i] * (size_t)b->b.blocks;
+        for (int j = 0; j < b->on_count; j++) {
+            const double *t = T + j * q * q, v = w[tss__sub_i(&b->on)[j]];
+            double *out = phi + j * q;
+            if (q == 4)
+                for (int k = 0; k < 4; k++)
+                    out[k] = v * (t[k] + (t[4 + k] * m[1] + (t[8 + k] * m[2] + t[12 + k] * m[3])));
+            else
+                for (int k = 0; k < 3; k++) out[k] = v * (t[k] + (t[3 + k] * m[1] + t[6 + k] * m[2]));
+        }
+    }
+}
+
 // Rows of the active scalar functions at local nodes of a body: phi, count × c.
 static void tss__sub_phi(const tss_subspace *s, int body, const int *node, int count, double *phi) {
     const tss__modal *m = tss__sub_modal(s, body);
@@ -3052,8 +3075,11 @@ static void tss__sub_phi(const tss_subspace *s, int body, const int *node, int c
     for (int k = 0; k < s->basis_count; k++) {
         const tss__sub_basis *b = tss__sub_base(s, k);
         if (!b->live || b->body != body || b->b.vector || b->on_count == 0) continue;
-        tss__basis_rows(&b->b, tss__sub_X(s, m), s->dim, node, count, tss__sub_i(&b->on), b->on_count, phi + at,
-                        m->c);
+        if (b->b.transform)
+            tss__sub_phi_factored(s, b, tss__sub_X(s, m), node, count, phi + at, m->c);
+        else
+            tss__basis_rows(&b->b, tss__sub_X(s, m), s->dim, node, count, tss__sub_i(&b->on), b->on_count, phi + at,
+                            m->c);
         for (int j = 0; j < b->on_count; j++)
             at += b->b.first[tss__sub_i(&b->on)[j] + 1] - b->b.first[tss__sub_i(&b->on)[j]];
     }
@@ -3087,6 +3113,22 @@ static void tss__sub_rows(const tss_subspace *s, int body, const int *world, int
         memset(phi + (size_t)i * (size_t)m->c, 0, (size_t)m->c * sizeof(double));
         memset(vec + (size_t)i * (size_t)(s->dim * m->r), 0, (size_t)(s->dim * m->r) * sizeof(double));
     }
+}
+
+// Transforms of the active blocks of factored bases, transposed for rows of four.
+static tss_result tss__sub_transpose(tss_subspace *s, int body) {
+    const int q = s->dim + 1;
+    for (int k = 0; k < s->basis_count; k++) {
+        tss__sub_basis *b = tss__sub_base(s, k);
+        if (!b->live || b->body != body || !b->b.transform) continue;
+        double *T = (double *)tss__sub_need(s, &b->transposed, (size_t)(b->b.blocks * q * q), sizeof(double));
+        if (!T) return tss__sub_no_memory(s);
+        for (int j = 0; j < b->on_count; j++)
+            for (int r = 0; r < q; r++)
+                for (int c = 0; c < q; c++)
+                    T[(j * q + c) * q + r] = b->b.transform[(tss__sub_i(&b->on)[j] * q + r) * q + c];
+    }
+    return TSS_OK;
 }
 
 // map and map_block from the lists of active functions and columns.
@@ -3144,7 +3186,8 @@ static tss_result tss__sub_count_active(tss_subspace *s, int body) {
         }
         if (b->b.vector) vectors += f; else scalars += f;
     }
-    return tss__sub_fill_map(s, m, column, vec);
+    r = tss__sub_transpose(s, body);
+    return r == TSS_OK ? tss__sub_fill_map(s, m, column, vec) : r;
 }
 
 typedef struct tss__sub_gram {
@@ -3410,8 +3453,6 @@ static void tss__sub_hessian_task(int p, int worker, void *arg) {
                                vec + (size_t)col[k] * (size_t)(d * r), T + (size_t)i * (size_t)(d * a));
         }
     tss__sub_gather(d, t->nodes, a, T, c, r, phi, vec, H);
-    for (int i = 0; i < a; i++)  // the two halves differ by rounding
-        for (int j = 0; j < i; j++) H[i * a + j] = H[j * a + i];
     t->fresh = 1;
 }
 
@@ -3463,7 +3504,17 @@ static void tss__sub_bfgs_task(int p, int worker, void *arg) {
     double *y = run->work + (size_t)worker * run->each, *Hs = y + a;
     double ys = 0, sHs = 0, yy = 0, hh = 0, ss = 0;
     memset(Hs, 0, (size_t)a * sizeof(double));
-    for (int i = 0; i < a; i++) y[i] = g1[i] - g0[i], tss__sub_axpy(a, step[i], H + (size_t)i * (size_t)a, Hs);
+    for (int j = 0; j < a; j++) {  // the lower triangle is what is kept
+        const double *col = H + (size_t)j * (size_t)a;
+        double sum[4] = {0, 0, 0, 0};
+        int i = j + 1;
+        tss__sub_axpy(a - j, step[j], col + j, Hs + j);
+        for (; i + 4 <= a; i += 4)
+            for (int t = 0; t < 4; t++) sum[t] += col[i + t] * step[i + t];
+        for (; i < a; i++) sum[0] += col[i] * step[i];
+        Hs[j] += (sum[0] + sum[1]) + (sum[2] + sum[3]);
+        y[j] = g1[j] - g0[j];
+    }
     for (int i = 0; i < a; i++)
         ys += y[i] * step[i], sHs += step[i] * Hs[i], yy += y[i] * y[i], hh += Hs[i] * Hs[i], ss += step[i] * step[i];
     memcpy(g0, g1, (size_t)a * sizeof(double));
@@ -3472,7 +3523,7 @@ static void tss__sub_bfgs_task(int p, int worker, void *arg) {
     if (t->skipped) return;
     for (int j = 0; j < a; j++) {
         double u = y[j] / ys, v = Hs[j] / sHs;
-        for (int i = 0; i < a; i++) H[(size_t)j * (size_t)a + (size_t)i] += u * y[i] - v * Hs[i];
+        for (int i = j; i < a; i++) H[(size_t)j * (size_t)a + (size_t)i] += u * y[i] - v * Hs[i];
     }
 }
 
@@ -3863,7 +3914,7 @@ typedef struct tss__sub_sum {
     double *H;
 } tss__sub_sum;
 
-// Column j of a body's Σ H^ℓ over its valid parts.
+// Column j of the lower triangle of a body's Σ H^ℓ over its valid parts.
 static void tss__sub_sum_task(int j, int worker, void *arg) {
     const tss__sub_sum *u = (const tss__sub_sum *)arg;
     const tss__modal *m = tss__sub_modal(u->s, u->body);
@@ -3872,7 +3923,8 @@ static void tss__sub_sum_task(int j, int worker, void *arg) {
     (void)worker;
     for (int p = m->group0; p < m->group0 + m->groups; p++) {
         const tss__sub_part *t = tss__sub_parts(u->s, p);
-        if (t->valid && t->fresh) tss__sub_axpy((int)a, 1, tss__sub_f(&u->s->secant) + t->h + (size_t)j * a, to);
+        if (t->valid && t->fresh)
+            tss__sub_axpy((int)a - j, 1, tss__sub_f(&u->s->secant) + t->h + (size_t)j * a + j, to + j);
     }
 }
 
@@ -3946,7 +3998,7 @@ static tss_result tss__sub_build_H(tss_subspace *s, const tss_unknowns *u, const
         tss_parallel(&s->host, m->a, tss__sub_sum_task, &sum);
         int count = tss__sub_pick_rows(s, u, k, -1, mask, list);
         r = tss__sub_project_rows(s, u, k, k, mask, list, count, H + m->hat);
-        for (int i = 0; i < m->a; i++)
+        for (int i = 0; i < m->a; i++)  // the two halves differ by rounding
             for (int j = 0; j < i; j++) H[m->hat + (size_t)(i * m->a + j)] = H[m->hat + (size_t)(j * m->a + i)];
     }
     for (int k = 0; k < s->crosses && r == TSS_OK; k++) {
@@ -4635,46 +4687,58 @@ static double tss__sub_ah2(const tss_subspace *s, const tss_ctx *c) {
     return c->ah2;
 }
 
-// F_i over the ring, and ℰ_i.
-static void tss__sub_node_task(int chunk, int worker, void *arg) {
+// F_i over the ring; fields start at 0.
+static void tss__sub_force_task(int chunk, int worker, void *arg) {
     const tss__sub_ask *q = (const tss__sub_ask *)arg;
     const tss_subspace *s = q->s;
     double ah2 = tss__sub_ah2(s, q->it->ctx);
-    int literal = s->def.oracle == TSS_ORACLE_LITERAL;
+    const double *gamma = tss__sub_f(s->def.oracle == TSS_ORACLE_LITERAL ? &s->gamma_print : &s->gamma);
     (void)worker;
     int to = (chunk + 1) * 1024 < s->n ? (chunk + 1) * 1024 : s->n;
     for (int i = chunk * 1024; i < to; i++) {
         tss__sub_f(&s->error)[i] = tss__sub_f(&s->progress)[i] = tss__sub_f(&s->force)[i] = 0;
-        double gamma = ah2 * tss__sub_f(literal ? &s->gamma_print : &s->gamma)[i];
-        double eta = ah2 * tss__sub_f(literal ? &s->eta_print : &s->eta)[i];
-        if (tss__sub_i(&s->body_of)[i] < 0 || !(gamma > 0)) continue;
+        if (tss__sub_i(&s->body_of)[i] < 0 || !(gamma[i] > 0)) continue;
         int r = q->u->row[i];
         double F = 0;
         for (int64_t k = s->A.row[r]; k < s->A.row[r + 1]; k++)
             F += tss__sub_norm(q->it->g + q->u->node[s->A.col[k]] * s->dim, s->dim);
-        tss__sub_f(&s->force)[i] = F / gamma;
-        tss__sub_f(&s->progress)[i] = tss__sub_f(&s->ring)[i] / eta;
+        tss__sub_f(&s->force)[i] = F / (ah2 * gamma[i]);
     }
 }
 
-static void tss__sub_group_task(int g, int worker, void *arg) {
+// 𝒢_i where F_i lets it pass; activate[g] 1: some node of the group has 𝒢 > ε_G.
+static void tss__sub_error_task(int g, int worker, void *arg) {
     const tss__sub_ask *q = (const tss__sub_ask *)arg;
     const tss_subspace *s = q->s;
-    int literal = s->def.oracle == TSS_ORACLE_LITERAL;
-    double ah2 = tss__sub_ah2(s, q->it->ctx);
+    const int literal = s->def.oracle == TSS_ORACLE_LITERAL;
+    const double ah2 = tss__sub_ah2(s, q->it->ctx), *scale = tss__sub_f(literal ? &s->gamma_print : &s->gamma);
     q->activate[g] = 0;
     for (int k = tss__sub_i(&s->group_ptr)[g]; k < tss__sub_i(&s->group_ptr)[g + 1]; k++) {
         int i = tss__sub_i(&s->group_node)[k];
-        if (tss__sub_i(&s->body_of)[i] < 0) continue;
         double F = tss__sub_f(&s->force)[i], *G = tss__sub_f(&s->error) + i;
-        int open = !tss__sub_u(&s->on)[i] && tss__sub_f(&s->progress)[i] < s->def.progress;
-        if (!q->all && (!open || q->activate[g] || (!literal && F <= s->def.error_nodes))) continue;
-        double gamma = ah2 * tss__sub_f(literal ? &s->gamma_print : &s->gamma)[i];
-        if (!(gamma > 0)) continue;
-        *G = tss__sub_ring_gradient(s, q->it, q->u, i, q->near + worker) / gamma;
+        if (tss__sub_i(&s->body_of)[i] < 0 || !(scale[i] > 0)) continue;
+        if (!q->all && (tss__sub_u(&s->on)[i] || (!literal && F <= s->def.error_nodes))) continue;
+        *G = tss__sub_ring_gradient(s, q->it, q->u, i, q->near + worker) / (ah2 * scale[i]);
         if (!literal && F < *G) *G = F;
-        if (open && *G > s->def.error_nodes) q->activate[g] = 1;
+        if (!tss__sub_u(&s->on)[i] && *G > s->def.error_nodes) q->activate[g] = 1;
     }
+}
+
+// ℰ_i, and which of the groups lack progress where their error is large.
+static void tss__sub_progress_task(int g, int worker, void *arg) {
+    const tss__sub_ask *q = (const tss__sub_ask *)arg;
+    const tss_subspace *s = q->s;
+    const double *scale = tss__sub_f(s->def.oracle == TSS_ORACLE_LITERAL ? &s->eta_print : &s->eta);
+    const double ah2 = tss__sub_ah2(s, q->it->ctx);
+    int activate = 0;
+    (void)worker;
+    for (int k = tss__sub_i(&s->group_ptr)[g]; k < tss__sub_i(&s->group_ptr)[g + 1]; k++) {
+        int i = tss__sub_i(&s->group_node)[k];
+        if (tss__sub_i(&s->body_of)[i] < 0 || !(scale[i] > 0)) continue;
+        double E = tss__sub_f(&s->progress)[i] = tss__sub_f(&s->ring)[i] / (ah2 * scale[i]);
+        activate |= !tss__sub_u(&s->on)[i] && tss__sub_f(&s->error)[i] > s->def.error_nodes && E < s->def.progress;
+    }
+    q->activate[g] = (uint8_t)activate;
 }
 
 // Nodes of one group, those that can be; returns how many are new.
@@ -4691,80 +4755,115 @@ static int tss__sub_enrich(tss_subspace *s, int g) {
     return count;
 }
 
-// 𝒢_s and ℰ_s of one block (Eq. 12–17): g^s = M Φ Φᵀ g and c^s = M Φ Φᵀ ΔE, Φ the block's functions,
-// orthonormal in the mass. ℰ_s = Σ c_j / Σ η_j, 𝒢_s = max ‖g_j^s‖ l/η_j, which meshes agree on; as
-// printed max ‖g_j^s‖/γ_j and Σ c_j²/η_j.
-static tss_result tss__sub_ask_block(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
-    tss__modal *m = tss__sub_modal(s, body);
+// The functions of one block at all nodes of its body: (nodes × f), or (nodes · d) × f columns.
+static tss_result tss__sub_block_rows(tss_subspace *s, int body, const tss__sub_block *q, double **out, int *width) {
+    const tss__modal *m = tss__sub_modal(s, body);
     const tss__sub_basis *b = tss__sub_base(s, q->basis);
-    const int d = s->dim, f0 = b->b.first[q->block], f = b->b.first[q->block + 1] - f0, vector = b->b.vector;
-    const int literal = s->def.oracle == TSS_ORACLE_LITERAL, width = vector ? f * d : f;
-    size_t n = (size_t)m->nodes, w = (size_t)width;
-    double *U = (double *)tss__sub_need(s, &s->columns, n * w + w * (size_t)(d + 1), sizeof(double));
-    int *local = (int *)tss__sub_need(s, &s->row_list, (size_t)s->n, sizeof(int));
-    if (!U || !local) return tss__sub_no_memory(s);
-    double *gs = U + n * w, *cs = gs + w * (size_t)d, ah2 = tss__sub_ah2(s, it->ctx), worst = 0, sum = 0, total = 0;
-    double all = 0;  // functions are orthonormal in mass / all
-    const double *mass = tss_world_masses(s->w);
-    for (int i = 0; i < m->nodes; i++) local[i] = i;
-    if (vector)
-        for (size_t i = 0; i < n * (size_t)d; i++)
+    const int f0 = b->b.first[q->block], f = b->b.first[q->block + 1] - f0;
+    size_t rows = (size_t)m->nodes * (size_t)(b->b.vector ? s->dim : 1);
+    double *U = (double *)tss__sub_need(s, &s->columns, rows * (size_t)f, sizeof(double));
+    if (!U) return tss__sub_no_memory(s);
+    if (b->b.vector)
+        for (size_t i = 0; i < rows; i++)
             for (int k = 0; k < f; k++) U[i * (size_t)f + (size_t)k] = b->b.value[i * (size_t)b->b.columns + (size_t)(f0 + k)];
     else
-        tss__basis_rows(&b->b, tss__sub_X(s, m), d, local, m->nodes, &q->block, 1, U, f);
-    memset(gs, 0, w * (size_t)(d + 1) * sizeof(double));
-    for (int i = 0; i < m->nodes; i++) {
-        int node = m->first + i;
-        if (tss__sub_i(&s->body_of)[node] != body) continue;
-        all += mass[node];
-        for (int k = 0; k < f; k++) {
-            double mean = 0;  // ū: average over the coordinates
-            for (int p = 0; p < d; p++) {
-                double v = vector ? U[(i * d + p) * f + k] : U[i * f + k];
-                gs[vector ? k : k * d + p] += v * it->g[node * d + p];
-                mean += v / d;
-            }
-            cs[k] += mean * tss__sub_f(&s->ring)[node];
-        }
-    }
-    for (int i = 0; i < m->nodes; i++) {
-        int node = m->first + i;
-        double g[3] = {0, 0, 0}, c = 0, eta = ah2 * tss__sub_f(literal ? &s->eta_print : &s->eta)[node];
-        if (tss__sub_i(&s->body_of)[node] != body || !(eta > 0)) continue;
-        for (int k = 0; k < f; k++) {
-            double mean = 0;
-            for (int p = 0; p < d; p++) {
-                double v = vector ? U[(i * d + p) * f + k] : U[i * f + k];
-                g[p] += mass[node] / all * v * gs[vector ? k : k * d + p];
-                mean += v / d;
-            }
-            c += mass[node] / all * mean * cs[k];
-        }
-        double scale = literal ? ah2 * tss__sub_f(&s->gamma_print)[node] : eta / m->diagonal / TSS__SUB_MODE_ERROR;
-        double e = tss__sub_norm(g, d) / scale;
-        worst = e > worst ? e : worst;
-        sum += literal ? c * c / eta : c, total += eta;
-    }
-    q->error = worst, q->progress = literal ? sum : total > 0 ? sum / total : 0;
+        tss__basis_rows(&b->b, tss__sub_X(s, m), s->dim, NULL, m->nodes, &q->block, 1, U, f);
+    *out = U, *width = f;
     return TSS_OK;
 }
 
-// All inactive blocks of all bodies; returns in *added how many join.
-static tss_result tss__sub_ask_modes(tss_subspace *s, const tss_iterate *it, int *added) {
-    for (int k = 0; k < s->modal_count; k++) {
-        tss__modal *m = tss__sub_modal(s, k);
-        if (m->enriched == m->modal_nodes) continue;
-        for (int j = 0; j < m->blocks; j++) {
-            tss__sub_block *q = tss__sub_blocks(m) + j;
-            if (q->active) continue;
-            tss_result r = tss__sub_ask_block(s, it, k, q);
-            if (r != TSS_OK) return r;
-            if (s->query || !(q->error > s->def.error_modes && q->progress < s->def.progress)) continue;
-            q->active = 1, q->age = 0, m->stale = 1;
-            ++*added;
-        }
+// 𝒢_s (Eq. 12, 14, 16): g^s = M Φ Φᵀ∇E, Φ the block's functions, orthonormal in the mass; max over
+// the nodes of ‖g_j^s‖ l/η_j, which meshes agree on; as printed ‖g_j^s‖/γ_j.
+static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
+    const tss__modal *m = tss__sub_modal(s, body);
+    const int d = s->dim, vector = tss__sub_base(s, q->basis)->b.vector, literal = s->def.oracle == TSS_ORACLE_LITERAL;
+    double *U, sum[3 * 64], ah2 = tss__sub_ah2(s, it->ctx), all = 0;
+    int f;
+    tss_result r = tss__sub_block_rows(s, body, q, &U, &f);
+    if (r != TSS_OK || f > 64) return r;
+    const double *mass = tss_world_masses(s->w) + m->first, *g = it->g + m->first * d;
+    memset(sum, 0, sizeof sum);
+    for (int i = 0; i < m->nodes; i++) {
+        if (tss__sub_i(&s->body_of)[m->first + i] != body) continue;
+        all += mass[i];
+        for (int p = 0; p < d; p++)
+            for (int k = 0; k < f; k++)
+                sum[vector ? k : p * 64 + k] += U[vector ? (i * d + p) * f + k : i * f + k] * g[i * d + p];
+    }
+    q->error = 0;
+    for (int i = 0; i < m->nodes; i++) {
+        double v[3] = {0, 0, 0}, eta = tss__sub_f(&s->eta)[m->first + i];
+        if (tss__sub_i(&s->body_of)[m->first + i] != body || !(eta > 0)) continue;
+        for (int p = 0; p < d; p++)
+            for (int k = 0; k < f; k++)
+                v[p] += U[vector ? (i * d + p) * f + k : i * f + k] * sum[vector ? k : p * 64 + k];
+        double scale = literal ? tss__sub_f(&s->gamma_print)[m->first + i] : eta / m->diagonal / TSS__SUB_MODE_ERROR;
+        double e = mass[i] / all * tss__sub_norm(v, d) / (ah2 * scale);
+        q->error = e > q->error ? e : q->error;
     }
     return TSS_OK;
+}
+
+// ℰ_s (Eq. 13, 15, 17): c^s = M Φ̄ Φ̄ᵀ ΔE, Φ̄ the functions averaged over coordinates;
+// Σ c_j / Σ η_j, as printed Σ c_j²/η_j.
+static tss_result tss__sub_block_progress(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
+    const tss__modal *m = tss__sub_modal(s, body);
+    const int d = tss__sub_base(s, q->basis)->b.vector ? s->dim : 1, literal = s->def.oracle == TSS_ORACLE_LITERAL;
+    double *U, c[64], ah2 = tss__sub_ah2(s, it->ctx), all = 0, sum = 0, total = 0;
+    int f;
+    tss_result r = tss__sub_block_rows(s, body, q, &U, &f);
+    if (r != TSS_OK || f > 64) return r;
+    const double *mass = tss_world_masses(s->w) + m->first;
+    memset(c, 0, sizeof c);
+    for (int i = 0; i < m->nodes; i++) {
+        if (tss__sub_i(&s->body_of)[m->first + i] != body) continue;
+        all += mass[i];
+        for (int p = 0; p < d; p++)
+            for (int k = 0; k < f; k++) c[k] += U[(i * d + p) * f + k] / d * tss__sub_f(&s->ring)[m->first + i];
+    }
+    for (int i = 0; i < m->nodes; i++) {
+        double v = 0, eta = ah2 * tss__sub_f(literal ? &s->eta_print : &s->eta)[m->first + i];
+        if (tss__sub_i(&s->body_of)[m->first + i] != body || !(eta > 0)) continue;
+        for (int p = 0; p < d; p++)
+            for (int k = 0; k < f; k++) v += U[(i * d + p) * f + k] / d * c[k];
+        v *= mass[i] / all;
+        sum += literal ? v * v / eta : v, total += eta;
+    }
+    q->progress = literal ? sum : total > 0 ? sum / total : 0;
+    return TSS_OK;
+}
+
+// Whether block j of a body is a candidate at all.
+static int tss__sub_candidate(const tss__modal *m, const tss__sub_block *q) {
+    return !q->active && m->enriched < m->modal_nodes;
+}
+
+// Errors of all inactive blocks; *open: some are above ε_G.
+static tss_result tss__sub_mode_errors(tss_subspace *s, const tss_iterate *it, int *open) {
+    tss_result r = TSS_OK;
+    for (int k = 0; k < s->modal_count; k++)
+        for (int j = 0; j < tss__sub_modal(s, k)->blocks && r == TSS_OK; j++) {
+            tss__sub_block *q = tss__sub_blocks(tss__sub_modal(s, k)) + j;
+            if (!tss__sub_candidate(tss__sub_modal(s, k), q)) continue;
+            r = tss__sub_block_error(s, it, k, q);
+            *open |= q->error > s->def.error_modes;
+        }
+    return r;
+}
+
+// Those of them that lack progress join; returns in *added how many.
+static tss_result tss__sub_join_modes(tss_subspace *s, const tss_iterate *it, int *added) {
+    tss_result r = TSS_OK;
+    for (int k = 0; k < s->modal_count; k++)
+        for (int j = 0; j < tss__sub_modal(s, k)->blocks && r == TSS_OK; j++) {
+            tss__sub_block *q = tss__sub_blocks(tss__sub_modal(s, k)) + j;
+            if (!tss__sub_candidate(tss__sub_modal(s, k), q) || (!s->query && q->error <= s->def.error_modes)) continue;
+            r = tss__sub_block_progress(s, it, k, q);
+            if (s->query || r != TSS_OK || q->progress >= s->def.progress) continue;
+            q->active = 1, q->age = 0, tss__sub_modal(s, k)->stale = 1;
+            ++*added;
+        }
+    return r;
 }
 
 // d_a = −H_a⁻¹ U_aᵀ∇E, by the step filters and a line search on E; ring gets ΔE_i. (Eq. 18, 7)
@@ -4802,29 +4901,32 @@ static tss_result tss__sub_own_direction(tss_subspace *s, const tss_iterate *it,
     return TSS_OK;
 }
 
-// One call of the oracle. s->added: nodes and blocks that joined.
+// One call of the oracle. s->added: nodes and blocks that joined. Errors come first: where none is
+// above its ε_G nothing can join, whatever the progress, and d_a is not needed.
 static tss_result tss__sub_ask_oracle(tss_subspace *s, const tss_iterate *it, const tss_unknowns *u) {
-    int inactive = 0, blocks = 0;
+    int open = 0, blocks = 0;
     s->added = 0;
-    tss_result r = tss__sub_own_direction(s, it, u);
-    if (r == TSS_OK) r = tss__sub_dynamic_near(s);
+    tss_result r = tss__sub_dynamic_near(s);
     if (r != TSS_OK) return r;
     tss__sub_ask q;
     memset(&q, 0, sizeof q);
     q.s = s, q.it = it, q.u = u, q.all = s->query || s->def.on_oracle != NULL;
-    size_t near = (size_t)tss_workers(&s->host) * sizeof(tss__sub_near);
-    q.activate = (uint8_t *)tss__sub_need(s, &s->scratch, near + (size_t)s->groups, 1);
-    if (!q.activate) return tss__sub_no_memory(s);
-    q.near = (tss__sub_near *)s->scratch.p, q.activate += near;
-    tss_parallel(&s->host, (s->n + 1023) / 1024, tss__sub_node_task, &q);
-    tss_parallel(&s->host, s->groups, tss__sub_group_task, &q);
+    q.near = (tss__sub_near *)tss__sub_need(s, &s->scratch, (size_t)tss_workers(&s->host), sizeof(tss__sub_near));
+    q.activate = (uint8_t *)tss__sub_need(s, &s->activate, (size_t)s->groups, 1);
+    if (!q.near || !q.activate) return tss__sub_no_memory(s);
+    tss_parallel(&s->host, (s->n + 1023) / 1024, tss__sub_force_task, &q);
+    tss_parallel(&s->host, s->groups, tss__sub_error_task, &q);
+    for (int g = 0; g < s->groups; g++) open |= q.activate[g];
+    if ((r = tss__sub_mode_errors(s, it, &open)) != TSS_OK) return r;
+    s->oracle_calls++;
+    tss_world_clock_phase(s->w, TSS_PHASE_ORACLE);
+    if (!open && !q.all) return TSS_OK;
+    if ((r = tss__sub_own_direction(s, it, u)) != TSS_OK) return r;
+    tss_parallel(&s->host, s->groups, tss__sub_progress_task, &q);
     for (int g = 0; g < s->groups && !s->query; g++)
         if (q.activate[g]) s->added += tss__sub_enrich(s, g);
-    for (int k = 0; k < s->modal_count; k++)
-        for (int j = 0; j < tss__sub_modal(s, k)->blocks; j++) inactive |= !tss__sub_blocks(tss__sub_modal(s, k))[j].active;
-    if (inactive) r = tss__sub_ask_modes(s, it, &blocks);
+    r = tss__sub_join_modes(s, it, &blocks);
     s->added += blocks;
-    s->oracle_calls++;
     if (s->def.on_oracle) {
         tss_oracle_fields f = {it->number, it->x, tss__sub_f(&s->d_a), tss__sub_f(&s->error), tss__sub_f(&s->progress),
                                tss__sub_f(&s->force), tss__sub_u(&s->on)};
@@ -5261,7 +5363,7 @@ static void tss__sub_free_basis(tss_subspace *s, tss__sub_basis *b) {
     if (!b->live) return;
     s->bytes -= b->b.bytes;
     tss__basis_free(&s->host, &b->b);
-    tss__sub_drop(s, &b->on);
+    tss__sub_drop(s, &b->on), tss__sub_drop(s, &b->transposed);
     b->live = 0;
 }
 
@@ -5279,7 +5381,7 @@ static void tss__sub_destroy(void *user, const tss_host *host) {
         &s->near_ptr, &s->near_id, &s->want, &s->live_row, &s->live_index, &s->row_list, &s->d_a, &s->x_a, &s->rhs,
         &s->H, &s->cross, &s->cross_val, &s->lane, &s->xrow, &s->xnode, &s->jrow, &s->jval, &s->small,
         &s->small_work, &s->small_rhs, &s->factors, &s->modal_work, &s->columns, &s->pair_key, &s->solution,
-        &s->scratch, &s->xmask, &s->dq, &s->dyn_ptr, &s->dyn_id, &s->pending};
+        &s->scratch, &s->xmask, &s->dq, &s->dyn_ptr, &s->dyn_id, &s->pending, &s->activate};
     for (size_t k = 0; k < sizeof all / sizeof *all; k++) tss__sub_drop(s, all[k]);
     tss_bcsr_free(&h, &s->Ax), tss_bcsr_free(&h, &s->Cx), tss_bcsr_free(&h, &s->Sq);
     tss_chol_destroy(s->chol_q), tss_chol_destroy(s->chol_x);

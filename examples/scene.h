@@ -1,6 +1,7 @@
 /* scene.h: scenes in words (for the example programs; needs cJSON)
 
-   #define SCENE_IMPLEMENTATION    // in one .c file, after tss.h, tss_ipc.h, tss_io.h, tss_shapes.h
+   #define SCENE_IMPLEMENTATION    // in one .c file, after tss.h, tss_ipc.h, tss_subspace.h,
+                                   // tss_io.h, tss_shapes.h
    #include "scene.h"
 
    scene s;
@@ -32,6 +33,19 @@
    solver.linear           auto | direct | pcg (auto)
    solver.pcg_tol          relative residual of the linear solve (1e-5)
    solver.pcg_iterations   bound on its iterations (10000)
+   solver.mode             adaptive | subspace | full (adaptive if a body has a basis, else full);
+                           in full, bases are not made
+   solver.error_nodes      below this, the oracle's error asks for no nodes (0.5)
+   solver.error_modes      nor for modes (0.5)
+   solver.progress         more progress than this needs no help (1e-4)
+   solver.downdate         what moves less than this share of the body's diagonal a second apart
+                           from its modes leaves, 1/s (0.1; 0: nothing leaves)
+   solver.keep             steps that what was activated stays at least (2)
+   solver.partitions       groups of nodes in all (0: one for each 100 nodes)
+   solver.oracle           ring | literal (ring)
+   solver.secant           bfgs | frozen | exact (bfgs)
+   solver.schur            auto | pcg | direct (auto)
+   solver.newton_residual  measure a full-space Newton step at the end of each step (false)
    contact.enabled         bodies and planes touch (true)
    contact.dhat            distance at which contact begins, m (0: use dhat_rel)
    contact.dhat_rel        the same over the diagonal (1e-3)
@@ -51,6 +65,14 @@
     .material              {kind, E, nu, rho, damping}: neo_hookean | stable_neo_hookean |
                            fixed_corotated | stvk | linear (neo_hookean), Pa (1e5), (0.4),
                            kg/m³ (1000), stiffness-proportional damping time, s (0)
+    .regions[]             {lower, upper, metres: as in pins; material: {E, nu, rho}}: of the cells
+                           whose centroid is in the box; later ones outweigh earlier ones
+    .basis                 one or a list of {kind: affine | quadratic | skinning | biharmonic |
+                           eigen | pod; count: handles or modes (16); initial: blocks active from
+                           the start (by kind; -1: all); heterogeneous: skinning knows the cells'
+                           stiffness (false); tol: of eigenpairs (1e-8); cache: file, read if it
+                           fits, else written; snapshots: of pod: files that `tss run --snapshots`
+                           wrote, found as meshes are}
     .velocity .angular_velocity   at the start, m/s, and degrees/s about the middle of its box
     .pins[]                {lower, upper: box, 0..1 of the body's; metres: true: in metres;
                            axes: "xyz"; motion; release: free outside the motion's time (false)}
@@ -76,7 +98,8 @@
    planes[]                {origin ([0, 0, 0]), normal ([0, 1, 0]), mu (contact.mu)}: half-spaces
    camera                  {azimuth (30), elevation (18), fov (32, 0: parallel), zoom (1), distance
                            (0: sees everything), target (middle of the scene)}
-   frames                  {size: [w, h] ([960, 640]), field: none | J | velocity | strain (none),
+   frames                  {size: [w, h] ([960, 640]), field: none | J | velocity | strain |
+                           enriched | error | progress (enriched if adaptive, else none),
                            range: [low, high], wireframe: 0..1 (0)}
    run                     {check (false), every (1), budget_ms (0), frames: "png,vtu,obj" ("")}
 
@@ -89,13 +112,13 @@
    ERRORS  Functions return 1, or 0 and a sentence: file, key or line, and what was expected.
    MEMORY  malloc. THREADS  One scene, one thread.
 
-   >>scene  >>scene_tools  >>scene_keys  >>scene_meshes  >>scene_json  >>scene_script
-   >>scene_build  >>scene_drive                                                                   */
+   >>scene  >>scene_tools  >>scene_keys  >>scene_meshes  >>scene_bases  >>scene_json  >>scene_script
+   >>scene_snapshots  >>scene_build  >>scene_drive                                                */
 #ifndef SCENE_H
 #define SCENE_H
 
-#if !defined(TSS_H) || !defined(TSS_IO_H) || !defined(TSS_SHAPES_H)
-#error "include tss.h, tss_ipc.h, tss_io.h and tss_shapes.h before scene.h"
+#if !defined(TSS_SUBSPACE_H) || !defined(TSS_IO_H) || !defined(TSS_SHAPES_H)
+#error "include tss.h, tss_ipc.h, tss_subspace.h, tss_io.h and tss_shapes.h before scene.h"
 #endif
 
 #ifdef __cplusplus
@@ -139,12 +162,28 @@ typedef struct scene_force {
     double force[3], acceleration[3], start, end;
 } scene_force;
 
+#define SCENE_PATH 512  // bytes of a file name
+
+// A basis as in tss_basis_def; it is made by scene_build.
+typedef struct scene_basis {
+    int kind, count, heterogeneous;
+    int initial;  // −2: chosen by kind
+    double tol;
+    char cache[SCENE_PATH];        // "": none
+    char (*snapshot)[SCENE_PATH];  // files
+    int snapshots;
+    tss_basis id;  // after scene_build, −1: not made
+} scene_basis;
+
 typedef struct scene_body {
     char name[80];
     tss_mesh mesh;           // x: positions at the start
     double *rest;            // nodes × 3; NULL: mesh.x
     int obstacle, collider;  // collider: a script's meshCO
     tss_material material;
+    double *E, *nu, *rho;  // of each cell; NULL: material's
+    scene_basis *basis;
+    int bases;
     double velocity[3], angular[3], mu;  // mu < 0: contact.mu
     float color[3];                      // color[0] < 0: chosen by number
     scene_pin *pin;
@@ -163,7 +202,11 @@ typedef enum scene_field {
     SCENE_FIELD_NONE,
     SCENE_FIELD_J,
     SCENE_FIELD_VELOCITY,
-    SCENE_FIELD_STRAIN
+    SCENE_FIELD_STRAIN,
+    SCENE_FIELD_ENRICHED,
+    SCENE_FIELD_ERROR,
+    SCENE_FIELD_PROGRESS,
+    SCENE_FIELD_AUTO  // enriched if the scene is adaptive, else none
 } scene_field;
 typedef enum scene_script {
     SCENE_SCRIPT_NONE,
@@ -193,7 +236,10 @@ typedef struct scene {
     } world;
     struct {
         double tol, tol_rel, pcg_tol;
-        int max_iterations, linear, pcg_iterations;
+        int max_iterations, linear, pcg_iterations, newton_residual;
+        int mode;  // tss_mode, −1: adaptive if a body has a basis, else full
+        double error_nodes, error_modes, progress, downdate;
+        int keep, partitions, oracle, secant, schur;
     } solver;
     struct {
         int enabled, friction_iterations, self, between;  // between: shapes touch each other
@@ -231,7 +277,10 @@ SCENE_API int scene_parse(scene *s, const char *name, const char *text, const ch
                           const char *const *set, int sets, scene_error *error);
 SCENE_API void scene_free(scene *s);  // a zeroed scene is allowed
 
-// A prepared world. host, on_iterate and ipc may be NULL. *out is NULL on error.
+// The mode that scene_build uses.
+SCENE_API tss_mode scene_mode(const scene *s);
+// A prepared world. host, on_iterate and ipc may be NULL. *out is NULL on error. A scene may be
+// built several times (the worlds are alike); scene_drive then needs scene_state for each world.
 SCENE_API int scene_build(scene *s, const tss_host *host,
                           void (*on_iterate)(const double *, const double *, void *), void *ctx,
                           tss_world **out, tss_ipc **ipc, scene_error *error);
@@ -240,6 +289,9 @@ SCENE_API int scene_drive(scene *s, tss_world *w, scene_error *error);
 // How far the motions are: saved beside the world's checkpoint. Returns the bytes it takes, or 0 if
 // data does not fit this scene; with data NULL only the size.
 SCENE_API size_t scene_state(scene *s, void *data, size_t size, int save);
+// Positions of all nodes go to a file as number `number`, ascending from 0, which starts it anew.
+// bodies[].basis.snapshots reads it.
+SCENE_API int scene_snapshot(const char *path, const tss_world *w, int number, scene_error *error);
 // Where a motion puts a point after it has run for clock seconds.
 SCENE_API void scene_pose(const scene_motion *m, double clock, const double *from, double *out);
 
@@ -252,6 +304,7 @@ SCENE_API void scene_pose(const scene_motion *m, double clock, const double *fro
 #define SCENE_IMPLEMENTATION_DONE
 
 #include <cjson/cJSON.h>
+#include <errno.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -430,7 +483,14 @@ typedef struct scene__key {
 
 static const char *const scene__integrators[] = {"bdf2", "euler", "newmark", "quasistatic", NULL};
 static const char *const scene__linears[] = {"auto", "direct", "pcg", NULL};
-static const char *const scene__fields[] = {"none", "J", "velocity", "strain", NULL};
+static const char *const scene__fields[] = {"none",     "J",     "velocity", "strain",
+                                            "enriched", "error", "progress", NULL};
+static const char *const scene__modes[] = {"adaptive", "subspace", "full", NULL};
+static const char *const scene__oracles[] = {"ring", "literal", NULL};
+static const char *const scene__secants[] = {"bfgs", "frozen", "exact", NULL};
+static const char *const scene__schurs[] = {"auto", "pcg", "direct", NULL};
+static const char *const scene__bases[] = {"affine", "quadratic", "skinning", "biharmonic",
+                                           "eigen",  "pod",       NULL};
 static const char *const scene__materials[] = {
     "neo_hookean", "stable_neo_hookean", "fixed_corotated", "stvk", "linear", NULL};
 
@@ -881,6 +941,19 @@ static scene__region scene__everywhere(void) {
     return where;
 }
 
+// lo, hi: the box that the region's 0..1 stand for.
+static int scene__inside(const scene__region *where, const double *lo, const double *hi,
+                         const double *x) {
+    for (int c = 0; c < 3; c++) {
+        // Slack: 1 must select the last layer whatever the rounding of lo + 1·(hi − lo).
+        double size = hi[c] - lo[c], slack = where->metres ? 0 : 1e-9 * size;
+        double a = where->metres ? where->lower[c] : lo[c] + where->lower[c] * size;
+        double b = where->metres ? where->upper[c] : lo[c] + where->upper[c] * size;
+        if (!(x[c] >= a - slack && x[c] <= b + slack)) return 0;
+    }
+    return 1;
+}
+
 // The nodes of a mesh that are in a box, NULL on no memory.
 static int *scene__select(const tss_mesh *m, const scene__region *where, int *count) {
     double lo[3], hi[3];
@@ -896,20 +969,95 @@ static int *scene__select(const tss_mesh *m, const scene__region *where, int *co
     }
     scene__box_empty(lo, hi);
     scene__box(m->x, m->nodes, lo, hi);
-    for (int i = 0; node && on && i < m->nodes; i++) {
-        int in = on[i];
-        for (int c = 0; c < 3 && in; c++) {
-            // Slack: 1 must select the last layer whatever the rounding of lo + 1·(hi − lo).
-            double size = hi[c] - lo[c], slack = where->metres ? 0 : 1e-9 * size,
-                   x = m->x[3 * i + c];
-            double a = where->metres ? where->lower[c] : lo[c] + where->lower[c] * size;
-            double b = where->metres ? where->upper[c] : lo[c] + where->upper[c] * size;
-            in = x >= a - slack && x <= b + slack;
-        }
-        if (in) node[(*count)++] = i;
-    }
+    for (int i = 0; node && on && i < m->nodes; i++)
+        if (on[i] && scene__inside(where, lo, hi, m->x + 3 * i)) node[(*count)++] = i;
     free(on);
     return node;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>scene_bases (private)
+// ---------------------------------------------------------------------------------------------
+
+static int scene__add_snapshot(scene__reader *r, const cJSON *v, void *base) {
+    scene_basis *b = (scene_basis *)base;
+    if (!cJSON_IsString(v) || strlen(v->valuestring) >= SCENE_PATH / 2)
+        return scene__expected(r, v, "a file name in \" \"");
+    void *p = scene__grow(b->snapshot, b->snapshots, sizeof *b->snapshot, r->error);
+    if (!p) return 0;
+    b->snapshot = (char(*)[SCENE_PATH])p;
+    scene__find(r, v->valuestring, b->snapshot[b->snapshots++], SCENE_PATH);
+    return 1;
+}
+
+static int scene__read_snapshots(scene__reader *r, const cJSON *v, void *base) {
+    return cJSON_IsString(v) ? scene__add_snapshot(r, v, base)
+                             : scene__read_array(r, v, scene__add_snapshot, base);
+}
+
+// The first four are not for every kind.
+static const scene__key scene__basis_keys[] = {
+    SCENE__INT(scene_basis, count, "count", 1, 1e6),
+    SCENE__OF(SCENE__FLAG, scene_basis, heterogeneous, "heterogeneous"),
+    SCENE__POS(scene_basis, tol, "tol"),
+    SCENE__FUN("snapshots", scene__read_snapshots),
+    SCENE__INT(scene_basis, initial, "initial", -1, 1e6),
+    SCENE__STR(scene_basis, cache, "cache", SCENE_PATH),
+    SCENE__ONE(scene_basis, kind, "kind", scene__bases),
+    SCENE__END};
+
+// Bit k: key k above has a meaning.
+static const unsigned scene__basis_uses[] = {0, 0, 1 | 2 | 4, 1, 1 | 4, 1 | 8};
+
+static int scene__read_one_basis(scene__reader *r, const cJSON *v, void *base) {
+    scene_body *b = (scene_body *)base;
+    void *p = scene__grow(b->basis, b->bases, sizeof *b->basis, r->error);
+    if (!p) return 0;
+    b->basis = (scene_basis *)p;
+    scene_basis *to = &b->basis[b->bases++];
+    to->kind = to->id = -1, to->count = 16, to->initial = -2, to->tol = 1e-8;
+    if (!scene__read_object(r, v, scene__basis_keys, to)) return 0;
+    if (to->kind < 0) return scene__fail(r->error, "%s: %s.kind is missing", r->s->file, r->where);
+    for (int k = 0; k < 4; k++)
+        if (!(scene__basis_uses[to->kind] >> k & 1) &&
+            cJSON_GetObjectItemCaseSensitive(v, scene__basis_keys[k].name))
+            return scene__fail(r->error, "%s: %s.%s has no meaning for kind \"%s\"", r->s->file,
+                               r->where, scene__basis_keys[k].name, scene__bases[to->kind]);
+    if (to->kind == TSS_BASIS_POD && to->snapshots == 0)
+        return scene__fail(r->error,
+                           "%s: %s.snapshots is missing, expected files that "
+                           "`tss run --snapshots` wrote",
+                           r->s->file, r->where);
+    return 1;
+}
+
+// base: a scene_body, or a raw one, which begins with it. What is given replaces what was there.
+static int scene__read_basis(scene__reader *r, const cJSON *v, void *base) {
+    return cJSON_IsArray(v) ? scene__read_array(r, v, scene__read_one_basis, base)
+                            : scene__read_one_basis(r, v, base);
+}
+
+static int scene__check_bases(scene__reader *r, const scene_body *b) {
+    if (b->obstacle && b->bases)
+        return scene__fail(r->error, "%s: %s.basis: %s is an obstacle, expected a soft body",
+                           r->s->file, r->where, b->name);
+    for (int k = 0; k < b->bases; k++) {
+        const scene_basis *p = &b->basis[k];
+        int most = p->kind == TSS_BASIS_EIGEN ? r->s->world.dim * b->mesh.nodes : b->mesh.nodes;
+        if (!(scene__basis_uses[p->kind] & 1) || p->kind == TSS_BASIS_POD || p->count <= most)
+            continue;
+        return scene__fail(r->error,
+                           "%s: %s.basis[%d].count is %d, expected at most %d: %s has "
+                           "%d nodes",
+                           r->s->file, r->where, k, p->count, most, b->name, b->mesh.nodes);
+    }
+    return 1;
+}
+
+static void scene__bases_free(scene_body *b) {
+    for (int k = 0; k < b->bases; k++) free(b->basis[k].snapshot);
+    free(b->basis);
+    b->basis = NULL, b->bases = 0;
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -931,6 +1079,17 @@ static const scene__key scene__solver_keys[] = {
     SCENE__ONE(scene, solver.linear, "linear", scene__linears),
     SCENE__POS(scene, solver.pcg_tol, "pcg_tol"),
     SCENE__INT(scene, solver.pcg_iterations, "pcg_iterations", 1, 1e9),
+    SCENE__OF(SCENE__FLAG, scene, solver.newton_residual, "newton_residual"),
+    SCENE__ONE(scene, solver.mode, "mode", scene__modes),
+    SCENE__NUM(scene, solver.error_nodes, "error_nodes", 0, 1e300),
+    SCENE__NUM(scene, solver.error_modes, "error_modes", 0, 1e300),
+    SCENE__NUM(scene, solver.progress, "progress", 0, 1e300),
+    SCENE__NUM(scene, solver.downdate, "downdate", 0, 1e300),
+    SCENE__INT(scene, solver.keep, "keep", 0, 1e9),
+    SCENE__INT(scene, solver.partitions, "partitions", 0, 1e9),
+    SCENE__ONE(scene, solver.oracle, "oracle", scene__oracles),
+    SCENE__ONE(scene, solver.secant, "secant", scene__secants),
+    SCENE__ONE(scene, solver.schur, "schur", scene__schurs),
     SCENE__END};
 
 static const scene__key scene__contact_keys[] = {
@@ -1020,7 +1179,7 @@ typedef struct scene__raw {
     scene__shape shape;
     int has_shape;
     double scale[3], rotate[3], translate[3];
-    const cJSON *pins, *forces;
+    const cJSON *pins, *forces, *regions;
 } scene__raw;
 
 typedef struct scene__box_item {  // an element of pins or forces
@@ -1073,6 +1232,11 @@ static int scene__keep_forces(scene__reader *r, const cJSON *v, void *base) {
     return ((scene__raw *)base)->forces = v, 1;
 }
 
+static int scene__keep_regions(scene__reader *r, const cJSON *v, void *base) {
+    (void)r;
+    return ((scene__raw *)base)->regions = v, 1;
+}
+
 static const scene__key scene__body_keys[] = {
     SCENE__STR(scene__raw, b.name, "name", sizeof(((scene_body *)0)->name)),
     SCENE__STR(scene__raw, mesh, "mesh", sizeof(((scene__raw *)0)->mesh)),
@@ -1085,6 +1249,8 @@ static const scene__key scene__body_keys[] = {
     SCENE__OF(SCENE__DEGREES, scene__raw, b.angular, "angular_velocity"),
     SCENE__FUN("pins", scene__keep_pins),
     SCENE__FUN("forces", scene__keep_forces),
+    SCENE__FUN("regions", scene__keep_regions),
+    SCENE__FUN("basis", scene__read_basis),
     SCENE__OF(SCENE__FLAG, scene__raw, b.obstacle, "obstacle"),
     SCENE__FUN("motion", scene__read_body_motion),
     SCENE__NUM(scene__raw, b.mu, "mu", 0, 1e6),
@@ -1094,6 +1260,7 @@ static const scene__key scene__body_keys[] = {
 // What may be set on a body that a script has placed.
 static const scene__key scene__late_keys[] = {
     SCENE__FUN("material", scene__read_material),
+    SCENE__FUN("basis", scene__read_basis),
     SCENE__OF(SCENE__VECTOR, scene_body, velocity, "velocity"),
     SCENE__OF(SCENE__DEGREES, scene_body, angular, "angular_velocity"),
     SCENE__NUM(scene_body, mu, "mu", 0, 1e6),
@@ -1195,6 +1362,70 @@ static int scene__read_force(scene__reader *r, const cJSON *v, void *base) {
     return node ? scene__nobody(r, b) : scene__fail(r->error, "out of memory");
 }
 
+typedef struct scene__region_item {
+    scene__region where;
+    double E, nu, rho;
+} scene__region_item;
+
+static const scene__key scene__region_material_keys[] = {
+    SCENE__POS(scene__region_item, E, "E"),
+    SCENE__NUM(scene__region_item, nu, "nu", -0.999, 0.4999),
+    SCENE__POS(scene__region_item, rho, "rho"), SCENE__END};
+
+static int scene__read_region_material(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_object(r, v, scene__region_material_keys, base);
+}
+
+static const scene__key scene__region_keys[] = {
+    SCENE__OF(SCENE__VECTOR, scene__region_item, where.lower, "lower"),
+    SCENE__OF(SCENE__VECTOR, scene__region_item, where.upper, "upper"),
+    SCENE__OF(SCENE__FLAG, scene__region_item, where.metres, "metres"),
+    SCENE__FUN("material", scene__read_region_material), SCENE__END};
+
+// Per-cell arrays, filled with the body's material when there are none yet.
+static int scene__cell_arrays(scene_body *b, int cells) {
+    double **to[3] = {&b->E, &b->nu, &b->rho};
+    const double all[3] = {b->material.E, b->material.nu, b->material.rho};
+    for (int k = 0; k < 3; k++) {
+        if (*to[k]) continue;
+        *to[k] = (double *)malloc(((size_t)cells + 1) * sizeof **to[k]);
+        for (int i = 0; *to[k] && i < cells; i++) (*to[k])[i] = all[k];
+    }
+    return b->E && b->nu && b->rho;
+}
+
+static void scene__centroid(const tss_mesh *m, const int *cell, int size, double *out) {
+    for (int c = 0; c < 3; c++) out[c] = 0;
+    for (int k = 0; k < size; k++)
+        for (int c = 0; c < 3; c++) out[c] += m->x[3 * cell[k] + c] / size;
+}
+
+static int scene__read_region(scene__reader *r, const cJSON *v, void *base) {
+    scene_body *b = (scene_body *)base;
+    const tss_mesh *m = &b->mesh;
+    int flat = r->s->world.dim == 2, cells = flat ? m->triangles : m->tets, found = 0;
+    const int *cell = flat ? m->triangle : m->tet;
+    scene__region_item it = {scene__everywhere(), b->material.E, b->material.nu, b->material.rho};
+    double lo[3], hi[3], at[3];
+    if (!scene__read_object(r, v, scene__region_keys, &it)) return 0;
+    if (!cJSON_GetObjectItemCaseSensitive(v, "material"))
+        return scene__fail(r->error, "%s: %s.material is missing", r->s->file, r->where);
+    if (!scene__cell_arrays(b, cells)) return scene__fail(r->error, "out of memory");
+    scene__box_empty(lo, hi);
+    scene__box(m->x, m->nodes, lo, hi);
+    for (int k = 0; k < cells; k++) {
+        scene__centroid(m, cell + k * (flat ? 3 : 4), flat ? 3 : 4, at);
+        if (!scene__inside(&it.where, lo, hi, at)) continue;
+        b->E[k] = it.E, b->nu[k] = it.nu, b->rho[k] = it.rho, found++;
+    }
+    return found ? 1
+                 : scene__fail(r->error,
+                               "%s: %s: no cell of %s has its centroid in this box "
+                               "(lower and upper are 0..1 of the body's box unless metres is "
+                               "true)",
+                               r->s->file, r->where, b->name);
+}
+
 // Makes a raw body's mesh: scale, rotate, translate; an obstacle keeps its surface only.
 static int scene__body_mesh(scene__reader *r, scene__raw *w) {
     tss_mesh *m = &w->b.mesh, surface;
@@ -1242,7 +1473,7 @@ static int scene__body_check(scene__reader *r, const scene_body *b) {
     if (b->obstacle && (b->pins || b->forces))
         return scene__fail(r->error, "%s: %s: an obstacle has a motion, not pins or forces",
                            r->s->file, r->where);
-    return 1;
+    return scene__check_bases(r, b);
 }
 
 static void scene__body_free(scene_body *b) {
@@ -1252,6 +1483,8 @@ static void scene__body_free(scene_body *b) {
     }
     for (int k = 0; k < b->forces; k++) free(b->force[k].node);
     free(b->pin), free(b->force), free(b->rest), free(b->motion.keyframe);
+    free(b->E), free(b->nu), free(b->rho);
+    scene__bases_free(b);
     tss_mesh_free(&b->mesh);
 }
 
@@ -1282,10 +1515,15 @@ static int scene__read_body(scene__reader *r, const cJSON *v, void *base) {
         snprintf(w.b.name, sizeof w.b.name, "%.60s %d",
                  w.has_shape ? scene__shape_names[w.shape.kind] : w.mesh, s->bodies);
     ok = ok && scene__body_mesh(r, &w);
-    for (int k = 0; ok && k < 2; k++) {
-        const cJSON *list = k ? w.forces : w.pins;
-        size_t n = scene__enter(r, k ? "forces" : "pins", 0);
-        if (list) ok = scene__read_array(r, list, k ? scene__read_force : scene__read_pin, &w.b);
+    if (ok && w.b.obstacle && w.regions)
+        ok = scene__fail(r->error, "%s: %s.regions: an obstacle has no cells", s->file, r->where);
+    for (int k = 0; ok && k < 3; k++) {
+        static const char *const name[] = {"pins", "forces", "regions"};
+        static scene__read_fn *const read[] = {scene__read_pin, scene__read_force,
+                                               scene__read_region};
+        const cJSON *list = k == 0 ? w.pins : k == 1 ? w.forces : w.regions;
+        size_t n = scene__enter(r, name[k], 0);
+        if (list) ok = scene__read_array(r, list, read[k], &w.b);
         if (ok) scene__leave(r, n);
     }
     ok = ok && scene__body_check(r, &w.b);
@@ -1359,7 +1597,10 @@ static int scene__read_bodies(scene__reader *r, const cJSON *v, void *base) {
             return scene__fail(r->error, "%s: bodies.%s: no such body, expected 0 to %d", s->file,
                                b->string, s->bodies - 1);
         size_t n = scene__enter(r, NULL, (int)k);
-        if (!scene__read_object(r, b, scene__late_keys, &s->body[k])) return 0;
+        if (cJSON_GetObjectItemCaseSensitive(b, "basis")) scene__bases_free(&s->body[k]);
+        if (!scene__read_object(r, b, scene__late_keys, &s->body[k]) ||
+            !scene__check_bases(r, &s->body[k]))
+            return 0;
         scene__leave(r, n);
     }
     return 1;
@@ -2010,8 +2251,91 @@ static int scene__read_script(scene__reader *r, const char *text) {
 }
 
 // ---------------------------------------------------------------------------------------------
+// >>scene_snapshots (private)
+// A head, then positions, nodes × dim doubles a snapshot, as this machine writes them.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct scene__snapshots {
+    char magic[8];
+    uint64_t nodes, dim, count;
+} scene__snapshots;
+
+static const char scene__snapshot_magic[8] = {'t', 's', 's', ' ', 's', 'n', 'p', '1'};
+
+int scene_snapshot(const char *path, const tss_world *w, int number, scene_error *error) {
+    scene__snapshots head;
+    size_t size = (size_t)tss_world_nodes(w) * (size_t)tss_world_dim(w);
+    FILE *f = fopen(path, number > 0 ? "r+b" : "wb");
+    memcpy(head.magic, scene__snapshot_magic, sizeof head.magic);
+    head.nodes = (uint64_t)tss_world_nodes(w), head.dim = (uint64_t)tss_world_dim(w);
+    head.count = (uint64_t)number + 1;
+    // The count last: a file that was cut short still says what it has.
+    int ok = f && (number > 0 || fwrite(&head, sizeof head, 1, f) == 1);
+    ok = ok && fseek(f, 0, SEEK_END) == 0 &&
+         fwrite(tss_world_positions(w), sizeof(double), size, f) == size;
+    ok = ok && fseek(f, 0, SEEK_SET) == 0 && fwrite(&head, sizeof head, 1, f) == 1;
+    if (f) ok = fclose(f) == 0 && ok;
+    return ok ? 1 : scene__fail(error, "%s: cannot be written: %s", path, strerror(errno));
+}
+
+// Opens a file of snapshots of this world; NULL and why it does not fit.
+static FILE *scene__open_snapshots(const char *path, const tss_world *w, scene__snapshots *head,
+                                   char *why, size_t size) {
+    FILE *f = fopen(path, "rb");
+    int n = tss_world_nodes(w), dim = tss_world_dim(w);
+    why[0] = 0;
+    if (!f)
+        snprintf(why, size, "cannot be read: %s", strerror(errno));
+    else if (fread(head, sizeof *head, 1, f) != 1 ||
+             memcmp(head->magic, scene__snapshot_magic, sizeof head->magic) != 0)
+        snprintf(why, size, "is no file that `tss run --snapshots` wrote");
+    else if (head->nodes != (uint64_t)n || head->dim != (uint64_t)dim)
+        snprintf(why, size, "is of %llu nodes in %llu dimensions, this scene has %d in %d",
+                 (unsigned long long)head->nodes, (unsigned long long)head->dim, n, dim);
+    else if (head->count < 1 || head->count > 1000000)
+        snprintf(why, size, "says it has %llu snapshots, expected 1 to 1000000",
+                 (unsigned long long)head->count);
+    if (f && why[0]) fclose(f);
+    return why[0] ? NULL : f;
+}
+
+// Appends a body's part of each snapshot of one file to x; *count of them so far.
+static int scene__read_snapshot_file(const scene_body *b, const char *path, const tss_world *w,
+                                     double **x, int *count, char *why, size_t size) {
+    scene__snapshots head;
+    size_t dim = (size_t)tss_world_dim(w), all = (size_t)tss_world_nodes(w) * dim;
+    size_t own = (size_t)b->mesh.nodes * dim, first = (size_t)b->first * dim;
+    FILE *f = scene__open_snapshots(path, w, &head, why, size);
+    if (!f) return 0;
+    double *row = (double *)malloc((all + 1) * sizeof *row);
+    double *to = (double *)realloc(*x, ((size_t)*count + head.count) * own * sizeof *to);
+    if (to) *x = to;
+    for (uint64_t k = 0; row && to && k < head.count && !why[0]; k++) {
+        if (fread(row, sizeof *row, all, f) != all)
+            snprintf(why, size, "ends in snapshot %llu of %llu", (unsigned long long)k + 1,
+                     (unsigned long long)head.count);
+        else
+            memcpy(to + own * (size_t)(*count)++, row + first, own * sizeof *row);
+    }
+    if (!row || !to) snprintf(why, size, "out of memory");
+    free(row);
+    fclose(f);
+    return !why[0];
+}
+
+// ---------------------------------------------------------------------------------------------
 // >>scene_build (private)
 // ---------------------------------------------------------------------------------------------
+
+static void scene__subspace_defaults(scene *s) {
+    tss_subspace_def d = tss_subspace_def_default();
+    s->solver.mode = -1;
+    s->solver.error_nodes = d.error_nodes, s->solver.error_modes = d.error_modes;
+    s->solver.progress = d.progress, s->solver.downdate = d.downdate;
+    s->solver.keep = d.keep, s->solver.partitions = d.partitions;
+    s->solver.oracle = (int)d.oracle, s->solver.secant = (int)d.secant,
+    s->solver.schur = (int)d.schur;
+}
 
 static void scene__defaults(scene *s, const char *file) {
     tss_world_def d = tss_world_def_default();
@@ -2022,11 +2346,12 @@ static void scene__defaults(scene *s, const char *file) {
     memcpy(s->world.gravity, d.gravity, sizeof s->world.gravity);
     s->solver.tol_rel = d.tol_rel, s->solver.pcg_tol = d.pcg_tol, s->solver.linear = (int)d.linear;
     s->solver.max_iterations = d.max_iterations, s->solver.pcg_iterations = d.pcg_iterations;
+    scene__subspace_defaults(s);
     s->contact.enabled = s->contact.self = s->contact.between = s->contact.friction_iterations = 1;
     s->contact.dhat_edge = tss_ipc_def_default().dhat_edge;
     s->contact.dhat_rel = s->contact.eps_v_rel = 1e-3;
     s->camera.azimuth = 30, s->camera.elevation = 18, s->camera.fov = 32, s->camera.zoom = 1;
-    s->frames.width = 960, s->frames.height = 640;
+    s->frames.width = 960, s->frames.height = 640, s->frames.field = SCENE_FIELD_AUTO;
     s->run.every = 1;
 }
 
@@ -2117,7 +2442,7 @@ static int scene__add_to_world(const scene *s, scene_body *b, tss_world *w, scen
     double *X = scene__pack(b->rest ? b->rest : b->mesh.x, b->mesh.nodes, dim);
     double *x = scene__pack(b->mesh.x, b->mesh.nodes, dim), *v = scene__velocities(b, dim, &ok);
     d.name = b->name, d.nodes = b->mesh.nodes, d.X = X, d.x0 = x, d.v0 = v;
-    d.material = b->material;
+    d.material = b->material, d.E = b->E, d.nu = b->nu, d.rho = b->rho;
     memcpy(d.velocity, b->velocity, sizeof d.velocity);
     if (b->obstacle) {
         scene__surface_def(b, &d);
@@ -2250,6 +2575,7 @@ static tss_world_def scene__world_def(const scene *s, const tss_host *host) {
     d.max_iterations = s->solver.max_iterations;
     d.linear = (tss_linear)s->solver.linear;
     d.pcg_tol = s->solver.pcg_tol, d.pcg_iterations = s->solver.pcg_iterations;
+    d.newton_residual = s->solver.newton_residual;
     return d;
 }
 
@@ -2306,6 +2632,97 @@ static int scene__add_contact(scene *s, tss_world *w, tss_ipc **ipc, scene_error
     free(plane), free(body), free(pair);
     return r == TSS_OK ? 1 : scene__world_fail(e, s, w, r);
 }
+
+tss_mode scene_mode(const scene *s) {
+    if (s->solver.mode >= 0) return (tss_mode)s->solver.mode;
+    for (int k = 0; k < s->bodies; k++)
+        if (s->body[k].bases > 0) return TSS_MODE_ADAPTIVE;
+    return TSS_MODE_FULL;
+}
+
+static tss_subspace_def scene__subspace_def(const scene *s) {
+    tss_subspace_def d = tss_subspace_def_default();
+    d.mode = scene_mode(s);
+    d.error_nodes = s->solver.error_nodes, d.error_modes = s->solver.error_modes;
+    d.progress = s->solver.progress, d.downdate = s->solver.downdate;
+    d.keep = s->solver.keep, d.partitions = s->solver.partitions;
+    d.oracle = (tss_oracle)s->solver.oracle, d.secant = (tss_secant)s->solver.secant,
+    d.schur = (tss_schur)s->solver.schur, d.pcg_tol = s->solver.pcg_tol;
+    return d;
+}
+
+static tss_basis_def scene__basis_def(const scene_basis *b) {
+    tss_basis_def d = b->kind == TSS_BASIS_QUADRATIC    ? tss_basis_quadratic()
+                      : b->kind == TSS_BASIS_SKINNING   ? tss_basis_skinning(b->count)
+                      : b->kind == TSS_BASIS_BIHARMONIC ? tss_basis_biharmonic(b->count)
+                      : b->kind == TSS_BASIS_EIGEN      ? tss_basis_eigen(b->count)
+                                                        : tss_basis_affine();
+    d.heterogeneous = b->heterogeneous, d.tol = b->tol;
+    d.cache = b->cache[0] ? b->cache : NULL;
+    if (b->initial > -2) d.initial = b->initial;
+    return d;
+}
+
+static int scene__add_basis(const scene *s, int body, int number, tss_world *w, scene_error *e) {
+    const scene_body *owner = &s->body[body];
+    scene_basis *b = &owner->basis[number];
+    double *x = NULL;
+    int count = 0;
+    char why[200] = "";
+    for (int k = 0; k < b->snapshots; k++)
+        if (!scene__read_snapshot_file(owner, b->snapshot[k], w, &x, &count, why, sizeof why)) {
+            free(x);
+            return scene__fail(e, "%s: bodies[%d].basis[%d].snapshots[%d]: %s %s", s->file, body,
+                               number, k, b->snapshot[k], why);
+        }
+    tss_basis_def d = scene__basis_def(b);
+    if (b->kind == TSS_BASIS_POD) {
+        tss_basis_def pod = tss_basis_pod(x, count, b->count);
+        if (b->initial > -2) pod.initial = b->initial;
+        pod.cache = d.cache, d = pod;
+    }
+    tss_result r = tss_basis_add(w, owner->id, &d, &b->id);
+    free(x);
+    if (r == TSS_OK) return 1;
+    return scene__fail(e, "%s: bodies[%d].basis[%d] (%s): %s", s->file, body, number,
+                       scene__bases[b->kind],
+                       tss_world_error(w)[0] ? tss_world_error(w) : tss_result_text(r));
+}
+
+// Nodes that a script moves are not pinned; a basis must find them scripted. In full mode, too:
+// the worlds of one scene are alike.
+static tss_result scene__mark_driven(const scene *s, tss_world *w) {
+    tss_result r = TSS_OK;
+    for (int k = 0; k < s->drivens; k++) {
+        const scene_driven *d = &s->driven[k];
+        if (d->state != 1 || s->body[d->body].obstacle) continue;
+        for (int i = 0; i < d->count && r == TSS_OK; i++)
+            r = tss_node_target(w, d->node[i], d->from + 3 * i);
+    }
+    return r;
+}
+
+static int scene__add_bases(const scene *s, tss_world *w, scene_error *e) {
+    tss_subspace_def d = scene__subspace_def(s);
+    int bases = 0;
+    for (int k = 0; k < s->bodies; k++) {
+        bases += s->body[k].bases;
+        for (int i = 0; i < s->body[k].bases; i++) s->body[k].basis[i].id = -1;
+    }
+    tss_result r = bases > 0 ? scene__mark_driven(s, w) : TSS_OK;
+    if (d.mode == TSS_MODE_FULL) return r == TSS_OK ? 1 : scene__world_fail(e, s, w, r);
+    if (bases == 0)
+        return scene__fail(e, "%s: solver.mode is \"%s\", but no body has a basis", s->file,
+                           scene__modes[d.mode]);
+    if (r == TSS_OK) r = tss_world_prepare(w);
+    if (r == TSS_OK) r = tss_subspace_add(w, &d, NULL);
+    if (r != TSS_OK) return scene__world_fail(e, s, w, r);
+    for (int k = 0; k < s->bodies; k++)
+        for (int i = 0; i < s->body[k].bases; i++)
+            if (!scene__add_basis(s, k, i, w, e)) return 0;
+    return 1;
+}
+
 int scene_build(scene *s, const tss_host *host,
                 void (*on_iterate)(const double *, const double *, void *), void *ctx,
                 tss_world **out, tss_ipc **ipc, scene_error *error) {
@@ -2325,6 +2742,7 @@ int scene_build(scene *s, const tss_host *host,
     }
     ok = ok && scene__add_script(s, error);
     if (ok && s->contact.enabled) ok = scene__add_contact(s, w, ipc, error);
+    ok = ok && scene__add_bases(s, w, error);
     s->forces_on = (char *)calloc((size_t)forces + 1, 1);
     if (ok && !s->forces_on) ok = scene__fail(error, "out of memory");
     if (ok && (r = tss_world_prepare(w)) != TSS_OK) ok = scene__world_fail(error, s, w, r);

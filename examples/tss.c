@@ -2,6 +2,10 @@
 
    tss run SCENE [-o DIR] [--steps N] [--threads N] [--budget-ms T] [--frames png,vtu,obj]
                  [--every K] [--resume FILE] [--assets DIR] [--set key=value]... [--check]
+                 [--mode adaptive|subspace|full] [--snapshots FILE]
+                 [--color enriched|error|progress|speed|J|strain|none]
+   tss compare SCENE [-o DIR] [--steps N] [--free-steps M] [--from STEP] [--repeat K] ...
+   tss modes SCENE [-o DIR] [--count K] ...
    tss check SCENE [--assets DIR] [--set key=value]...
    tss --version | --help
 
@@ -9,16 +13,27 @@
    (out/NAME) stats.csv: a row a step; frames/NNNN.png, vtu/ with frames.pvd, obj/: one each K steps;
    checkpoint.bin and report.html. It ends with the 64-bit hash of positions and velocities: the same
    for any number of threads. --check hands every accepted iterate to an independent judge
-   (tests/checker.h). check is the doctor: it says what is wrong with a scene, and takes no step.
+   (tests/checker.h). --snapshots keeps positions each K steps, for a basis of kind pod. check is
+   the doctor: it says what is wrong with a scene, and takes no step. modes lists and draws bases.
+
+   compare takes each step from the same state in full space (direct, pcg, auto) and adaptively;
+   then M steps freely. DIR/compare.csv has a row a step. Its last line:
+       error E speedup S best B final F
+   E: the largest over the steps of max ‖x − x_full‖ / max ‖x_full − x_t‖, max over the nodes that
+   are free to move; S, B: time of the direct solver and of the best full one (smallest total) over
+   that of the adaptive one; F: largest distance of a node after the M free steps from where the
+   direct solver has it, over the diagonal of the soft bodies.
 
    EXIT  0 well; 1 the doctor found an error; 2 a file, key or option is at fault; 3 a step did not
    meet its tolerance; 4 the judge found a violation or could not decide.
 
-   >>options  >>run  >>judge  >>frames  >>stats  >>checkpoints  >>summary  >>main              */
+   >>options  >>run  >>judge  >>frames  >>stats  >>checkpoints  >>summary  >>stepping  >>compare
+   >>modes  >>main                                                                             */
 #define _POSIX_C_SOURCE 200809L
 #define TSS_IMPLEMENTATION
 #include "tss.h"
 #include "tss_ipc.h"
+#include "tss_subspace.h"
 #include "tss_io.h"
 #include "tss_shapes.h"
 
@@ -47,10 +62,10 @@
 #define MAX_SETS 256
 
 typedef struct options {
-    const char *command, *scene, *assets, *frames, *resume;
-    char out[512];
+    const char *command, *scene, *assets, *frames, *resume, *snapshots;
+    char out[512], mode[80], color[80];  // mode, color: as key=value
     const char *set[MAX_SETS];
-    int sets, steps, threads, every, check;
+    int sets, steps, threads, every, check, repeat, from, free_steps, count;
     double budget_ms;
 } options;
 
@@ -58,7 +73,12 @@ static int usage(FILE *to) {
     fputs(
         "usage: tss run SCENE [-o DIR] [--steps N] [--threads N] [--budget-ms T]\n"
         "               [--frames png,vtu,obj] [--every K] [--resume FILE] [--assets DIR]\n"
-        "               [--set key=value]... [--check]\n"
+        "               [--set key=value]... [--check] [--mode adaptive|subspace|full]\n"
+        "               [--snapshots FILE] [--color enriched|error|progress|speed|J|strain|none]\n"
+        "       tss compare SCENE [-o DIR] [--steps N] [--free-steps M] [--from STEP] [--repeat "
+        "K]\n"
+        "               [--threads N] [--assets DIR] [--set key=value]...\n"
+        "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
         "       tss --version\n",
         to);
@@ -105,6 +125,27 @@ static int complain(const char *what, const char *value, const char *expected) {
     return 0;
 }
 
+static int add_set(options *o, const char *line) {
+    return o->sets < MAX_SETS ? (o->set[o->sets++] = line, 1)
+                              : complain("--set", line, "no more than 256");
+}
+
+// An option that is short for --set key=value; text is where the line stays.
+static int take_key(options *o, const char *key, const char *value, char text[80]) {
+    if (strlen(key) + strlen(value) > 78) return complain(key, value, "a shorter word");
+    snprintf(text, 80, "%s=%s", key, value);
+    return add_set(o, text);
+}
+
+static int take_color(options *o, const char *value) {
+    static const char *const names[] = {"none",     "speed", "J",       "strain",
+                                        "enriched", "error", "progress"};
+    for (size_t k = 0; k < sizeof names / sizeof *names; k++)
+        if (strcmp(value, names[k]) == 0)
+            return take_key(o, "frames.field", k == 1 ? "velocity" : value, o->color);
+    return complain("--color", value, "enriched, error, progress, speed, J, strain or none");
+}
+
 // One option and its value; 0: bad.
 static int take(options *o, const char *name, const char *value) {
     static const struct {
@@ -113,7 +154,11 @@ static int take(options *o, const char *name, const char *value) {
         size_t to;
     } counts[] = {{"--steps", 0, offsetof(options, steps)},
                   {"--threads", 1, offsetof(options, threads)},
-                  {"--every", 1, offsetof(options, every)}};
+                  {"--every", 1, offsetof(options, every)},
+                  {"--repeat", 1, offsetof(options, repeat)},
+                  {"--from", 0, offsetof(options, from)},
+                  {"--free-steps", 0, offsetof(options, free_steps)},
+                  {"--count", 1, offsetof(options, count)}};
     if (!value) return complain(name, "", "a value");
     for (size_t k = 0; k < sizeof counts / sizeof *counts; k++)
         if (strcmp(name, counts[k].name) == 0)
@@ -124,9 +169,10 @@ static int take(options *o, const char *name, const char *value) {
     if (strcmp(name, "--assets") == 0) return o->assets = value, 1;
     if (strcmp(name, "--frames") == 0) return o->frames = value, 1;
     if (strcmp(name, "--resume") == 0) return o->resume = value, 1;
-    if (strcmp(name, "--set") == 0)
-        return o->sets < MAX_SETS ? (o->set[o->sets++] = value, 1)
-                                  : complain(name, value, "no more than 256");
+    if (strcmp(name, "--snapshots") == 0) return o->snapshots = value, 1;
+    if (strcmp(name, "--mode") == 0) return take_key(o, "solver.mode", value, o->mode);
+    if (strcmp(name, "--color") == 0) return take_color(o, value);
+    if (strcmp(name, "--set") == 0) return add_set(o, value);
     if (strcmp(name, "--budget-ms") == 0)
         return tss_parse_double(value, strlen(value), &o->budget_ms) == TSS_OK && o->budget_ms > 0
                    ? 1
@@ -136,7 +182,7 @@ static int take(options *o, const char *name, const char *value) {
 
 static int read_options(int argc, char **argv, options *o) {
     memset(o, 0, sizeof *o);
-    o->steps = -1;
+    o->steps = o->free_steps = -1, o->repeat = 1;
     o->command = argv[1];
     for (int k = 2; k < argc; k++) {
         if (strcmp(argv[k], "--check") == 0)
@@ -157,21 +203,27 @@ static int read_options(int argc, char **argv, options *o) {
 // ---------------------------------------------------------------------------------------------
 
 // What a row of stats.csv holds; `i` is the step's info, `c` what contact counted.
-#define COLUMNS(X)                                                                                \
-    X(step, r->step) X(time, i->time) X(status, i->status) X(newton, i->newton)                   \
-    X(linear_iters, i->linear_iterations) X(enriched_nodes, i->enriched_nodes) X(nodes, i->nodes)  \
-    X(active_modes, i->active_modes) X(modes, i->modes) X(contacts, i->contacts)                   \
-    X(residual_max, i->residual_max) X(residual_mean, i->residual_mean) X(min_J, i->min_J)         \
-    X(min_distance, i->min_distance) X(seconds, i->seconds) X(decrement, i->decrement)             \
-    X(target_left, i->target_left) X(min_alpha, i->min_alpha)                                      \
-    X(factorizations, i->factorizations) X(energy_s, i->phase_seconds[TSS_PHASE_ENERGY])           \
-    X(gradient_s, i->phase_seconds[TSS_PHASE_GRADIENT])                                            \
-    X(hessian_s, i->phase_seconds[TSS_PHASE_HESSIAN])                                              \
-    X(assemble_s, i->phase_seconds[TSS_PHASE_ASSEMBLE])                                            \
-    X(linear_s, i->phase_seconds[TSS_PHASE_LINEAR])                                                \
-    X(collision_s, i->phase_seconds[TSS_PHASE_COLLISION])                                          \
-    X(other_s, i->phase_seconds[TSS_PHASE_OTHER]) X(bytes, i->bytes)                               \
-    X(allocations, i->allocations) CONTACT_COLUMNS(X)
+#define COLUMNS(X)                                                                                 \
+    X(step, r->step)                                                                               \
+    X(time, i->time) X(status, i->status) X(newton, i->newton) X(                                  \
+        linear_iters, i->linear_iterations) X(enriched_nodes, i->enriched_nodes)                   \
+        X(nodes, i->nodes) X(active_modes, i->active_modes) X(modes, i->modes) X(                  \
+            contacts, i->contacts) X(residual_max, i->residual_max)                                \
+            X(residual_mean, i->residual_mean) X(residual_newton, i->residual_newton) X(           \
+                oracle_error, i->oracle_error) X(min_J, i->min_J) X(min_distance, i->min_distance) \
+                X(seconds, i->seconds) X(decrement, i->decrement) X(target_left, i->target_left)   \
+                    X(min_alpha, i->min_alpha) X(factorizations, i->factorizations)                \
+                        X(energy_s, i->phase_seconds[TSS_PHASE_ENERGY])                            \
+                            X(gradient_s, i->phase_seconds[TSS_PHASE_GRADIENT])                    \
+                                X(hessian_s, i->phase_seconds[TSS_PHASE_HESSIAN])                  \
+                                    X(assemble_s, i->phase_seconds[TSS_PHASE_ASSEMBLE])            \
+                                        X(linear_s, i->phase_seconds[TSS_PHASE_LINEAR])            \
+                                            X(collision_s, i->phase_seconds[TSS_PHASE_COLLISION])  \
+                                                X(oracle_s, i->phase_seconds[TSS_PHASE_ORACLE])    \
+                                                    X(other_s, i->phase_seconds[TSS_PHASE_OTHER])  \
+                                                        X(bytes, i->bytes)                         \
+                                                            X(allocations, i->allocations)         \
+                                                                CONTACT_COLUMNS(X)
 
 #define CONTACT_COLUMNS(X)                                                                        \
     X(candidates, c.candidates) X(kept, c.kept) X(active, c.active) X(frictional, c.frictional)    \
@@ -200,7 +252,8 @@ typedef struct run {
     scene_error why;
     tss_world *w;
     tss_ipc *ipc;
-    int step, failed;  // failed: steps that did not converge
+    tss_subspace *sub;            // NULL: full space
+    int step, snapshots, failed;  // failed: steps that did not converge
     char worst[300];   // the first of them
     row *rows;
     int row_count;
@@ -209,6 +262,8 @@ typedef struct run {
     view *view;
     view_camera camera;
     double *x3, *field;         // positions with three coordinates; the scalar to show
+    double shown[2];            // its range, of error and progress
+    double *oracle;             // what the oracle knows of each node, for .vtu
     tss_mesh all, skin;         // for .vtu and .obj
     char **pictures, **states;  // files written
     double *picture_times, *state_times;
@@ -279,14 +334,20 @@ static int make_folder(run *r, const char *path) {
     }
 }
 
-static int open_folders(run *r) {
-    const char *name = strrchr(r->o.scene, '/'), *sub[] = {"frames", "vtu", "obj"};
-    int on[] = {r->png, r->vtu, r->obj};
-    char path[600];
+// What -o says, or out/ and the scene's name.
+static const char *out_folder(run *r) {
+    const char *name = strrchr(r->o.scene, '/');
     name = name ? name + 1 : r->o.scene;
     if (!r->o.out[0])
         snprintf(r->o.out, sizeof r->o.out, "out/%.*s", (int)strcspn(name, "."), name);
-    if (!make_folder(r, r->o.out)) return 0;
+    return r->o.out;
+}
+
+static int open_folders(run *r) {
+    const char *sub[] = {"frames", "vtu", "obj"};
+    int on[] = {r->png, r->vtu, r->obj};
+    char path[600];
+    if (!make_folder(r, out_folder(r))) return 0;
     for (int k = 0; k < 3; k++) {
         snprintf(path, sizeof path, "%s/%s", r->o.out, sub[k]);
         if (on[k] && !make_folder(r, path)) return 0;
@@ -357,9 +418,9 @@ static int gather_cells(const run *r, int with_barrier, int *out) {
 }
 
 static void mark_kinematic(run *r) {
+    if (!r->kinematic) return;
     const uint8_t *kind = tss_world_kinds(r->w);
-    for (int i = 0; r->kinematic && i < tss_world_nodes(r->w); i++)
-        r->kinematic[i] = kind[i] != TSS_NODE_FREE;
+    for (int i = 0; i < tss_world_nodes(r->w); i++) r->kinematic[i] = kind[i] != TSS_NODE_FREE;
 }
 
 static void judge_planes(run *r, check_mesh *m) {
@@ -471,16 +532,11 @@ static double cell_field(const run *r, const int *cell) {
 }
 
 // Cell values go to their nodes, weighted by rest volume; nodes of obstacles are not a number.
-static void fill_field(run *r) {
+static void fill_cells(run *r) {
     int n = tss_world_nodes(r->w), dim = r->s.world.dim;
-    const double *v = tss_world_velocities(r->w);
     double *weight = (double *)need((size_t)n, sizeof *weight), D[9];
-    for (int i = 0; i < n; i++) {
-        double s = 0;
-        for (int c = 0; c < dim; c++) s += v[dim * i + c] * v[dim * i + c];
-        r->field[i] = r->s.frames.field == SCENE_FIELD_VELOCITY ? sqrt(s) : 0;
-    }
-    for (int b = 0; b < r->s.bodies && r->s.frames.field != SCENE_FIELD_VELOCITY; b++) {
+    memset(r->field, 0, (size_t)n * sizeof *r->field);
+    for (int b = 0; b < r->s.bodies; b++) {
         tss_body_info info;
         if (r->s.body[b].obstacle || tss_body_get(r->w, r->s.body[b].id, &info) != TSS_OK) continue;
         const int *cell = tss_body_cells(r->w, r->s.body[b].id);
@@ -490,17 +546,83 @@ static void fill_field(run *r) {
             for (int i = 0; i <= dim; i++) r->field[cell[i]] += vol * value, weight[cell[i]] += vol;
         }
     }
-    for (int i = 0; i < n && r->s.frames.field != SCENE_FIELD_VELOCITY; i++)
-        r->field[i] /= weight[i];
+    for (int i = 0; i < n; i++) r->field[i] /= weight[i];
     free(weight);
 }
 
+static void fill_speed(run *r) {
+    int dim = r->s.world.dim;
+    const double *v = tss_world_velocities(r->w);
+    for (int i = 0; i < tss_world_nodes(r->w); i++) {
+        double s = 0;
+        for (int c = 0; c < dim; c++) s += v[dim * i + c] * v[dim * i + c];
+        r->field[i] = sqrt(s);
+    }
+}
+
+// Decimal logarithms; where the oracle did not look there is no number.
+static void fill_log(run *r, const double *value) {
+    double *lo = &r->shown[0], *hi = &r->shown[1];
+    *lo = INFINITY, *hi = 0;
+    for (int i = 0; i < tss_world_nodes(r->w); i++) {
+        r->field[i] = value[i] > 0 ? log10(value[i]) : NAN;
+        if (value[i] > 0) *lo = fmin(*lo, value[i]), *hi = fmax(*hi, value[i]);
+    }
+    if (!(*lo <= *hi)) *lo = *hi = 0;
+}
+
+static void fill_field(run *r) {
+    tss_subspace_info sub;
+    memset(&sub, 0, sizeof sub);
+    if (r->sub) tss_subspace_get_info(r->sub, &sub);
+    switch (r->s.frames.field) {
+        case SCENE_FIELD_VELOCITY:
+            fill_speed(r);
+            break;
+        case SCENE_FIELD_ENRICHED:
+            for (int i = 0; i < tss_world_nodes(r->w); i++)
+                r->field[i] = sub.enriched && sub.enriched[i];
+            break;
+        case SCENE_FIELD_ERROR:
+        case SCENE_FIELD_PROGRESS: {
+            const double *v = r->s.frames.field == SCENE_FIELD_ERROR ? sub.error : sub.progress;
+            if (v) fill_log(r, v);
+            break;
+        }
+        default:
+            fill_cells(r);
+    }
+}
+
+// Error and progress: whole decades around what is there, at most six.
+static void log_range(const run *r, double *lo, double *hi) {
+    const double *range = r->s.frames.has_range ? r->s.frames.range : r->shown;
+    *hi = range[1] > 0 ? log10(range[1]) : 0, *lo = range[0] > 0 ? log10(range[0]) : *hi - 6;
+    if (r->s.frames.has_range) return;
+    *hi = ceil(*hi), *lo = fmax(floor(*lo), *hi - 6);
+    if (*lo >= *hi) *lo = *hi - 1;
+}
+
+static int log_field(const run *r) {
+    return r->s.frames.field == SCENE_FIELD_ERROR || r->s.frames.field == SCENE_FIELD_PROGRESS;
+}
+
 static void field_range(const run *r, double *lo, double *hi) {
+    if (log_field(r)) {
+        log_range(r, lo, hi);
+        return;
+    }
     *lo = r->s.frames.field == SCENE_FIELD_J ? 0.5 : 0;
     *hi = r->s.frames.field == SCENE_FIELD_J        ? 1.5
           : r->s.frames.field == SCENE_FIELD_STRAIN ? 0.5
                                                     : 1;
     if (r->s.frames.has_range) *lo = r->s.frames.range[0], *hi = r->s.frames.range[1];
+}
+
+static view_map field_map(const run *r) {
+    return r->s.frames.field == SCENE_FIELD_J ? VIEW_MAP_BALANCE
+           : log_field(r)                     ? VIEW_MAP_EMBER
+                                              : VIEW_MAP_SEA;
 }
 
 static view_style body_style(const run *r, int b) {
@@ -514,8 +636,10 @@ static view_style body_style(const run *r, int b) {
     style.crease = body->obstacle ? 30 : 50;
     if (r->s.frames.field != SCENE_FIELD_NONE && !body->obstacle) {
         style.scalar = r->field + body->first;
-        style.map = r->s.frames.field == SCENE_FIELD_J ? VIEW_MAP_BALANCE : VIEW_MAP_SEA;
+        style.map = field_map(r);
         field_range(r, &style.lo, &style.hi);
+        if (r->s.frames.field == SCENE_FIELD_ENRICHED)
+            style.lo = 0, style.hi = 1, style.darken = 0.9f;
     }
     return style;
 }
@@ -627,12 +751,32 @@ static void remember(char ***files, double **times, int *count, const char *path
     (*times)[(*count)++] = time;
 }
 
+static void label_frame(const run *r, view_image *im) {
+    char line[160], unit[40];
+    const char *name = strrchr(r->o.scene, '/'), *field = scene__fields[r->s.frames.field];
+    double lo, hi;
+    tss_subspace_info sub;
+    int n = snprintf(line, sizeof line, "step %d   t = %.3f s", r->step, tss_world_time(r->w));
+    size_t left = sizeof line - (size_t)n;
+    if (r->s.frames.field == SCENE_FIELD_ENRICHED) {
+        tss_subspace_get_info(r->sub, &sub);
+        snprintf(line + n, left, "   enriched (dark) %d of %d nodes, %d modes", sub.enriched_nodes,
+                 sub.nodes, sub.active_modes);
+    } else if (log_field(r)) {
+        snprintf(line + n, left, "   %s %.2e to %.2e", field, r->shown[0], r->shown[1]);
+    }
+    view_label(im, name ? name + 1 : r->o.scene, line);
+    if (r->s.frames.field == SCENE_FIELD_NONE || r->s.frames.field == SCENE_FIELD_ENRICHED) return;
+    field_range(r, &lo, &hi);
+    snprintf(unit, sizeof unit, "%s%s", log_field(r) ? "log10 " : "", field);
+    view_colour_bar(im, field_map(r), lo, hi, unit);
+}
+
 static int draw_frame(run *r) {
-    double lo[3], hi[3], low, high;
-    char path[700], line[100];
+    double lo[3], hi[3];
+    char path[700];
     view_error why;
     view_look look = scene_look(r);
-    const char *name = strrchr(r->o.scene, '/');
     scene_box(r, lo, hi);
     view_begin(r->view, &r->camera, &look);
     for (int b = 0; b < r->s.bodies; b++) draw_body(r, b);
@@ -640,12 +784,7 @@ static int draw_frame(run *r) {
         if (r->s.world.dim == 2 || !level(&r->s.plane[k])) draw_plane(r, &r->s.plane[k], lo, hi);
     view_image im = view_render(r->view);
     if (!im.rgb) return fail(r, "out of memory for a picture");
-    snprintf(line, sizeof line, "step %d   t = %.3f s", r->step, tss_world_time(r->w));
-    view_label(&im, name ? name + 1 : r->o.scene, line);
-    field_range(r, &low, &high);
-    if (r->s.frames.field != SCENE_FIELD_NONE)
-        view_colour_bar(&im, r->s.frames.field == SCENE_FIELD_J ? VIEW_MAP_BALANCE : VIEW_MAP_SEA,
-                        low, high, scene__fields[r->s.frames.field]);
+    label_frame(r, &im);
     snprintf(path, sizeof path, "%s/frames/%04d.png", r->o.out, r->step);
     if (!view_write_png(path, &im, &why)) return fail(r, "%s", why.message);
     remember(&r->pictures, &r->picture_times, &r->picture_count, path, tss_world_time(r->w));
@@ -714,12 +853,38 @@ static int build_skin(run *r) {
     return 1;
 }
 
+// What the oracle knows of each node; returns how many fields went to out.
+static int oracle_fields(run *r, tss_field out[4]) {
+    static const char *const name[] = {"enriched", "group", "error", "progress"};
+    int n = tss_world_nodes(r->w);
+    tss_subspace_info sub;
+    if (!r->sub) return 0;
+    tss_subspace_get_info(r->sub, &sub);
+    if (!r->oracle) r->oracle = (double *)need(4 * (size_t)n, sizeof(double));
+    for (int i = 0; i < n; i++) {
+        r->oracle[i] = sub.enriched ? sub.enriched[i] : 0;
+        r->oracle[n + i] = sub.group ? sub.group[i] : -1;
+        r->oracle[2 * n + i] = sub.error ? sub.error[i] : 0;
+        r->oracle[3 * n + i] = sub.progress ? sub.progress[i] : 0;
+    }
+    for (int k = 0; k < 4; k++) {
+        out[k].name = name[k], out[k].values = r->oracle + (size_t)k * (size_t)n;
+        out[k].components = 1, out[k].on_cells = 0;
+    }
+    return 4;
+}
+
 static int write_state(run *r) {
     char path[700];
     tss_io_error why;
-    int field = r->s.frames.field != SCENE_FIELD_NONE;
-    tss_field fields[2] = {{"velocity", tss_world_velocities(r->w), r->s.world.dim, 0},
-                           {scene__fields[r->s.frames.field], r->field, 1, 0}};
+    int shown = r->s.frames.field;
+    int field = shown != SCENE_FIELD_NONE && shown < SCENE_FIELD_ENRICHED;
+    tss_field fields[6] = {{"velocity", tss_world_velocities(r->w), r->s.world.dim, 0},
+                           {shown == SCENE_FIELD_VELOCITY ? "speed"
+                            : field                       ? scene__fields[shown]
+                                                          : "",
+                            r->field, 1, 0}};
+    field += r->vtu ? oracle_fields(r, fields + 1 + field) : 0;
     snprintf(path, sizeof path, "%s/vtu/%04d.vtu", r->o.out, r->step);
     if (r->vtu && tss_mesh_write_vtu(&r->all, r->x3, path, fields, 1 + field, 0, &why) != TSS_OK)
         return fail(r, "%s: %s", why.file, why.message);
@@ -849,10 +1014,13 @@ static void record(run *r, const tss_step_info *i) {
         print_bar(r, i);
         return;
     }
-    printf(
-        "step %d t %.4f %s newton %d contacts %d residual %.3g min_J %.3g distance %.3g %.3f s\n",
-        r->step, i->time, tss_status_text(i->status), i->newton, i->contacts, i->residual_max,
-        i->min_J, i->min_distance, i->seconds);
+    printf("step %d t %.4f %s newton %d contacts %d residual %.3g min_J %.3g distance %.3g %.3f s",
+           r->step, i->time, tss_status_text(i->status), i->newton, i->contacts, i->residual_max,
+           i->min_J, i->min_distance, i->seconds);
+    if (r->sub)
+        printf(" modes %d/%d enriched %d/%d", i->active_modes, i->modes, i->enriched_nodes,
+               i->nodes);
+    printf("\n");
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -938,6 +1106,13 @@ static void print_summary(const run *r) {
         r->row_count, r->row_count - r->failed, s, s_max, n, n_max);
     printf("worst residual %.3g m/s, least J %.4g, least distance %.3g m\n", res_max,
            smallest(r, COL_min_J), smallest(r, COL_min_distance));
+    if (r->sub) {
+        double nodes, nodes_max, modes, modes_max;
+        totals(r, COL_enriched_nodes, &nodes, &nodes_max);
+        totals(r, COL_active_modes, &modes, &modes_max);
+        printf("enriched nodes %.1f (most %.0f), active modes %.1f (most %.0f)\n", nodes, nodes_max,
+               modes, modes_max);
+    }
     if (r->failed) printf("not converged: %s\n", r->worst);
     printf("state %016llx\n", (unsigned long long)tss_world_hash(r->w));
 }
@@ -950,7 +1125,7 @@ static double *column_of(const run *r, column k) {
 
 // One plot over time; nothing is drawn for the end of the list (-1).
 static void plot(report *p, const run *r, report_plot look, const column *which, int count) {
-    report_series series[8];
+    report_series series[8] = {{NULL, NULL, NULL, 0}};
     double *x = column_of(r, COL_time), *y[8];
     for (int k = 0; k < count; k++) {
         y[k] = column_of(r, which[k]);
@@ -962,21 +1137,41 @@ static void plot(report *p, const run *r, report_plot look, const column *which,
     free(x);
 }
 
+static void report_subspace(report *p, const run *r) {
+    static const column modes[] = {COL_active_modes}, nodes[] = {COL_enriched_nodes},
+                        error[] = {COL_oracle_error};
+    char of[60];
+    tss_subspace_info sub;
+    tss_subspace_get_info(r->sub, &sub);
+    report_plot a = report_plot_default("Active modes", "time, s", "modes");
+    snprintf(of, sizeof of, "of %d", sub.modes);
+    a.zero = 1, a.note = of;
+    plot(p, r, a, modes, 1);
+    a = report_plot_default("Enriched nodes", "time, s", "nodes");
+    snprintf(of, sizeof of, "of %d", sub.nodes);
+    a.zero = 1, a.note = of;
+    plot(p, r, a, nodes, 1);
+    a = report_plot_default("Largest error of a node that is not enriched", "time, s", "error");
+    a.log_y = 1;
+    plot(p, r, a, error, 1);
+}
+
 static void report_plots(report *p, const run *r) {
     static const column work[] = {COL_newton}, touch[] = {COL_contacts},
                         error[] = {COL_residual_max, COL_residual_mean}, gap[] = {COL_min_distance},
                         J[] = {COL_min_J},
                         phase[] = {COL_energy_s, COL_gradient_s,  COL_hessian_s, COL_assemble_s,
-                                   COL_linear_s, COL_collision_s, COL_other_s};
+                                   COL_linear_s, COL_collision_s, COL_oracle_s,  COL_other_s};
     report_plot a = report_plot_default("Newton iterates", "time, s", "iterates a step");
     a.zero = 1;
     plot(p, r, a, work, 1);
+    if (r->sub) report_subspace(p, r);
     a = report_plot_default("Contacts", "time, s", "active pairs");
     a.zero = 1;
     plot(p, r, a, touch, 1);
     a = report_plot_default("Where the time goes", "time, s", "seconds a step");
     a.stacked = 1;
-    plot(p, r, a, phase, 7);
+    plot(p, r, a, phase, 8);
     a = report_plot_default("Residual", "time, s", "m/s");
     a.log_y = 1;
     plot(p, r, a, error, 2);
@@ -987,10 +1182,22 @@ static void report_plots(report *p, const run *r) {
 }
 
 static void report_scene(report *p, const run *r) {
-    static const char *const names[] = {"bodies",  "nodes",      "cells",   "surface triangles",
-                                        "step, s", "integrator", "threads", "state"};
-    char text[8][60];
-    const char *values[8];
+    static const char *const names[] = {"bodies",
+                                        "nodes",
+                                        "cells",
+                                        "surface triangles",
+                                        "step, s",
+                                        "integrator",
+                                        "threads",
+                                        "state",
+                                        "solver",
+                                        "bases: modes, groups of nodes",
+                                        "setup, s; held by the solver, MB"};
+    char text[11][60];
+    const char *values[11];
+    tss_subspace_info sub;
+    memset(&sub, 0, sizeof sub);
+    if (r->sub) tss_subspace_get_info(r->sub, &sub);
     int obstacles = 0;
     for (int b = 0; b < r->s.bodies; b++) obstacles += r->s.body[b].obstacle;
     snprintf(text[0], 60, "%d soft, %d obstacles, %d planes", r->s.bodies - obstacles, obstacles,
@@ -1002,8 +1209,11 @@ static void report_scene(report *p, const run *r) {
     snprintf(text[5], 60, "%s", scene__integrators[r->s.world.integrator]);
     snprintf(text[6], 60, "%d", r->o.threads);
     snprintf(text[7], 60, "%016llx", (unsigned long long)tss_world_hash(r->w));
-    for (int k = 0; k < 8; k++) values[k] = text[k];
-    report_table(p, "Scene", names, values, 8);
+    snprintf(text[8], 60, "%s", scene__modes[scene_mode(&r->s)]);
+    snprintf(text[9], 60, "%d: %d, %d", sub.bases, sub.modes, sub.groups);
+    snprintf(text[10], 60, "%.3f; %.1f", sub.setup_seconds, 1e-6 * (double)sub.bytes);
+    for (int k = 0; k < 11; k++) values[k] = text[k];
+    report_table(p, "Scene", names, values, r->sub ? 11 : 9);
 }
 
 static int write_report(run *r, int judged, int sound) {
@@ -1020,6 +1230,12 @@ static int write_report(run *r, int judged, int sound) {
     report_status(p, "A step takes", text, REPORT_INFO);
     snprintf(text, sizeof text, "%.1f, worst %.0f", n, n_max);
     report_status(p, "Newton iterates a step", text, REPORT_INFO);
+    if (r->sub) {
+        totals(r, COL_enriched_nodes, &n, &n_max);
+        snprintf(text, sizeof text, "%.1f, most %.0f of %.0f", n, n_max,
+                 r->row_count > 0 ? r->rows[0].v[COL_nodes] : 0);
+        report_status(p, "Enriched nodes", text, REPORT_INFO);
+    }
     if (judged)
         report_status(p, "Independent judge", sound ? "no violation" : "violations",
                       sound ? REPORT_GOOD : REPORT_BAD);
@@ -1030,7 +1246,7 @@ static int write_report(run *r, int judged, int sound) {
 }
 
 // ---------------------------------------------------------------------------------------------
-// >>main
+// >>stepping
 // ---------------------------------------------------------------------------------------------
 
 // What the command line says outweighs the scene.
@@ -1044,42 +1260,60 @@ static int read_scene(run *r) {
     if (r->o.frames && strlen(r->o.frames) >= sizeof r->s.run.frames)
         return fail(r, "--frames %s: expected some of png,vtu,obj", r->o.frames);
     if (r->o.frames) snprintf(r->s.run.frames, sizeof r->s.run.frames, "%s", r->o.frames);
+    if (r->s.frames.has_range && log_field(r) &&
+        !(r->s.frames.range[0] > 0 && r->s.frames.range[1] > r->s.frames.range[0]))
+        return fail(r,
+                    "%s: frames.range is [%g, %g], expected 0 < low < high: %s is drawn on a "
+                    "logarithmic scale",
+                    r->o.scene, r->s.frames.range[0], r->s.frames.range[1],
+                    scene__fields[r->s.frames.field]);
     return read_formats(r);
 }
 
-static int build_world(run *r) {
+// What frames show when the scene does not say it.
+static int choose_field(run *r) {
+    int *field = &r->s.frames.field;
+    if (*field == SCENE_FIELD_AUTO)
+        *field = scene_mode(&r->s) == TSS_MODE_ADAPTIVE ? SCENE_FIELD_ENRICHED : SCENE_FIELD_NONE;
+    return *field < SCENE_FIELD_ENRICHED || scene_mode(&r->s) != TSS_MODE_FULL
+               ? 1
+               : fail(r, "%s: frames.field is \"%s\", which full space does not have", r->o.scene,
+                      scene__fields[*field]);
+}
+
+static int build_world(run *r, tss_world **w, tss_ipc **ipc) {
     tss_host host = tss_host_default();
     host.clock = now, host.log = print_log, host.workers = r->o.threads;
 #ifdef _OPENMP
     if (r->o.threads > 0)
         omp_set_num_threads(r->o.threads);  // pictures and the judge use OpenMP themselves
 #endif
-    if (!scene_build(&r->s, &host, judge_iterate, r, &r->w, &r->ipc, &r->why)) return 0;
+    if (!scene_build(&r->s, &host, judge_iterate, r, w, ipc, &r->why)) return 0;
     r->o.threads = tss_workers(&host);
     return 1;
 }
 
-static int take_step(run *r, tss_step_info *info) {
-    if (!scene_drive(&r->s, r->w, &r->why)) return 0;
+static int step_world(run *r, tss_world *w, int step, tss_step_info *info) {
+    if (!scene_drive(&r->s, w, &r->why)) return 0;
     mark_kinematic(r);
-    tss_result e = r->s.run.budget_ms > 0
-                       ? tss_world_step_for(r->w, 1e-3 * r->s.run.budget_ms, info)
-                       : tss_world_step(r->w, info);
-    return e == TSS_OK
-               ? 1
-               : fail(r, "%s: step %d: %s", r->o.scene, r->step + 1,
-                      tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e));
+    tss_result e = r->s.run.budget_ms > 0 ? tss_world_step_for(w, 1e-3 * r->s.run.budget_ms, info)
+                                          : tss_world_step(w, info);
+    return e == TSS_OK ? 1
+                       : fail(r, "%s: step %d: %s", r->o.scene, step,
+                              tss_world_error(w)[0] ? tss_world_error(w) : tss_result_text(e));
 }
 
 static int take_steps(run *r) {
     tss_step_info info;
     if (!r->o.resume && !write_frame(r)) return 0;
     while (r->step < r->s.world.steps) {
-        if (!take_step(r, &info)) return 0;
+        if (!step_world(r, r->w, r->step + 1, &info)) return 0;
         r->step++;
         record(r, &info);
         if (r->step % r->s.run.every != 0 && r->step != r->s.world.steps) continue;
         if (!write_frame(r) || !write_checkpoint(r)) return 0;
+        if (r->o.snapshots && !scene_snapshot(r->o.snapshots, r->w, r->snapshots++, &r->why))
+            return 0;
     }
     return 1;
 }
@@ -1091,8 +1325,8 @@ static void run_free(run *r) {
     for (int k = 0; k < r->picture_count; k++) free(r->pictures[k]);
     for (int k = 0; k < r->state_count; k++) free(r->states[k]);
     free(r->pictures), free(r->states), free(r->picture_times), free(r->state_times), free(r->rows);
-    free(r->x3), free(r->field), free(r->kinematic), free(r->node_body), free(r->skin_first),
-        free(r->halfspaces);
+    free(r->x3), free(r->field), free(r->oracle), free(r->kinematic), free(r->node_body),
+        free(r->skin_first), free(r->halfspaces);
     tss_mesh_free(&r->all);
     tss_mesh_free(&r->skin);
     view_destroy(r->view);
@@ -1124,7 +1358,9 @@ static int run_judged(run *r) {
 
 static int command_run(run *r) {
     r->terminal = isatty(1), r->started = now(NULL);
-    if (!read_scene(r) || !build_world(r) || !open_folders(r)) return 2;
+    if (!read_scene(r) || !choose_field(r) || !build_world(r, &r->w, &r->ipc) || !open_folders(r))
+        return 2;
+    r->sub = tss_subspace_of(r->w);
     if (r->o.resume && !read_checkpoint(r)) return 2;
     if (!open_stats(r) || !open_frames(r)) return 2;
     int sound = run_judged(r);
@@ -1134,12 +1370,28 @@ static int command_run(run *r) {
     return sound < 0 ? 4 : r->failed ? 3 : 0;
 }
 
+// Bases are there by now; what is left to say is where they have less than was asked for.
+static void check_bases(const run *r) {
+    for (int b = 0; b < r->s.bodies; b++)
+        for (int k = 0; k < r->s.body[b].bases; k++) {
+            const scene_basis *p = &r->s.body[b].basis[k];
+            tss_basis_info info;
+            if (p->id < 0 || tss_basis_get(r->w, p->id, &info) != TSS_OK) continue;
+            if (p->kind == TSS_BASIS_POD && info.functions < p->count)
+                printf("%s: note: bodies[%d].basis[%d]: the snapshots give %d modes, not %d\n",
+                       r->o.scene, b, k, info.functions, p->count);
+            if (p->initial > info.blocks)
+                printf("%s: note: bodies[%d].basis[%d].initial is %d, but there are %d blocks\n",
+                       r->o.scene, b, k, p->initial, info.blocks);
+        }
+}
+
 static int command_check(run *r) {
     static const char *const words[] = {"note", "warning", "error"};
     tss_check_report c;
     tss_result e;
     if (!read_scene(r)) return 2;
-    if (!build_world(r)) return 1;
+    if (!build_world(r, &r->w, &r->ipc)) return 1;
     if ((e = tss_world_check(r->w, &c)) != TSS_OK)
         return fail(r, "%s: %s", r->o.scene,
                     tss_world_error(r->w)[0] ? tss_world_error(r->w) : tss_result_text(e)),
@@ -1148,21 +1400,459 @@ static int command_check(run *r) {
         printf("%s: %s: %s\n", r->o.scene, words[c.issue[k].severity], c.issue[k].text);
     if (c.errors + c.warnings + c.notes > c.count)
         printf("... and %d more\n", c.errors + c.warnings + c.notes - c.count);
+    check_bases(r);
     printf("%s: %d bodies, %d nodes, %d steps of %g s: %d errors, %d warnings\n", r->o.scene,
            r->s.bodies, tss_world_nodes(r->w), r->s.world.steps, r->s.world.dt, c.errors,
            c.warnings);
     return c.errors > 0;
 }
 
+// ---------------------------------------------------------------------------------------------
+// >>compare
+// One world a solver, all built alike. Before each step every world takes over the state of the
+// direct one; what the adaptive one has activated stays with it.
+// ---------------------------------------------------------------------------------------------
+
+enum { DIRECT, PCG, AUTO, ADAPTIVE, SOLVERS };
+
+typedef struct contender {
+    tss_world *w;
+    tss_step_info info;
+    double seconds, total;  // of this step (best of the repetitions), of all
+    void *kept;             // checkpoint before the step
+} contender;
+
+typedef struct contest {
+    contender c[SOLVERS];
+    void *motions;         // of the scene, before the step
+    double *x_t, *x_free;  // start of the step; the direct solver's end of the free steps
+    double error, worst_seconds;
+    int steps, free_steps, failed;
+    FILE *csv;
+} contest;
+
+static void *save_world(const tss_world *w, size_t *size) {
+    *size = tss_world_save(w, NULL, 0);
+    void *data = need(*size, 1);
+    (void)tss_world_save(w, data, *size);
+    return data;
+}
+
+static int load_world(run *r, tss_world *w, const void *data, size_t size) {
+    tss_result e = tss_world_load(w, data, size);
+    return e == TSS_OK ? 1 : fail(r, "%s: %s", r->o.scene, tss_world_error(w));
+}
+
+static void *save_motions(run *r) {
+    size_t size = scene_state(&r->s, NULL, 0, 1);
+    void *data = need(size, 1);
+    (void)scene_state(&r->s, data, size, 1);
+    return data;
+}
+
+static void load_motions(run *r, void *data) {
+    (void)scene_state(&r->s, data, scene_state(&r->s, NULL, 0, 0), 0);
+}
+
+static int has_bases(const scene *s) {
+    for (int k = 0; k < s->bodies; k++)
+        if (s->body[k].bases > 0) return 1;
+    return 0;
+}
+
+// The adaptive world last: it leaves the numbers of the bases in the scene.
+static int build_contenders(run *r, contest *t) {
+    static const int linear[] = {TSS_LINEAR_DIRECT, TSS_LINEAR_PCG, TSS_LINEAR_AUTO};
+    int mode = r->s.solver.mode, own = r->s.solver.linear;
+    tss_ipc *ipc;
+    if (!has_bases(&r->s))
+        return fail(r, "%s: no body has a basis: nothing to compare", r->o.scene);
+    for (int k = 0; k < SOLVERS; k++) {
+        r->s.solver.linear = k < ADAPTIVE ? linear[k] : own;
+        r->s.solver.mode = k < ADAPTIVE                ? (int)TSS_MODE_FULL
+                           : mode == TSS_MODE_SUBSPACE ? mode
+                                                       : (int)TSS_MODE_ADAPTIVE;
+        if (!build_world(r, &t->c[k].w, &ipc)) return 0;
+    }
+    return 1;
+}
+
+// The direct solver's way to step `from`; then all stand there.
+static int run_ahead(run *r, contest *t) {
+    size_t size;
+    for (int k = 0; k < r->o.from; k++) {
+        if (!step_world(r, t->c[DIRECT].w, k + 1, &t->c[DIRECT].info)) return 0;
+        fprintf(stderr, "compare: on the way to step %d: %d\n", r->o.from, k + 1);
+    }
+    if (r->o.from == 0) return 1;
+    void *data = save_world(t->c[DIRECT].w, &size);
+    int ok = 1;
+    for (int k = 1; ok && k < SOLVERS; k++) ok = load_world(r, t->c[k].w, data, size);
+    free(data);
+    return ok;
+}
+
+// max ‖x − y‖ over the nodes that are free to move, or all.
+static double farthest(const tss_world *w, const double *x, const double *y, int all) {
+    int dim = tss_world_dim(w);
+    const uint8_t *kind = tss_world_kinds(w);
+    double most = 0;
+    for (int i = 0; i < tss_world_nodes(w); i++) {
+        double s = 0;
+        for (int c = 0; c < dim; c++)
+            s += (x[dim * i + c] - y[dim * i + c]) * (x[dim * i + c] - y[dim * i + c]);
+        if (all || kind[i] == TSS_NODE_FREE) most = fmax(most, s);
+    }
+    return sqrt(most);
+}
+
+// All solvers in turn, so that what slows the machine down slows them all.
+static int repeat_step(run *r, contest *t, int step, const size_t *size) {
+    for (int k = 0; k < SOLVERS; k++) t->c[k].seconds = INFINITY;
+    for (int i = 0; i < r->o.repeat; i++)
+        for (int k = 0; k < SOLVERS; k++) {
+            contender *c = &t->c[k];
+            if (i > 0 && !load_world(r, c->w, c->kept, size[k])) return 0;
+            load_motions(r, t->motions);
+            if (!step_world(r, c->w, step, &c->info)) return 0;
+            c->seconds = fmin(c->seconds, c->info.seconds);
+        }
+    for (int k = 0; k < SOLVERS; k++) t->c[k].total += t->c[k].seconds;
+    return 1;
+}
+
+static int compare_step(run *r, contest *t, int step) {
+    tss_world *direct = t->c[DIRECT].w;
+    size_t size[SOLVERS], wide = (size_t)tss_world_nodes(direct) * (size_t)tss_world_dim(direct);
+    memcpy(t->x_t, tss_world_positions(direct), wide * sizeof(double));
+    t->motions = save_motions(r);
+    int ok = 1;
+    for (int k = 1; ok && k < SOLVERS; k++) {
+        tss_result e = tss_world_copy_state(t->c[k].w, direct);
+        if (e != TSS_OK) ok = fail(r, "%s: %s", r->o.scene, tss_result_text(e));
+    }
+    for (int k = 0; ok && k < SOLVERS && r->o.repeat > 1; k++)
+        t->c[k].kept = save_world(t->c[k].w, &size[k]);
+    ok = ok && repeat_step(r, t, step, size);
+    for (int k = 0; k < SOLVERS; k++) free(t->c[k].kept), t->c[k].kept = NULL;
+    free(t->motions);
+    t->motions = NULL;
+    return ok;
+}
+
+static double step_error(const contest *t) {
+    const tss_world *w = t->c[DIRECT].w;
+    const double *full = tss_world_positions(w), *x = tss_world_positions(t->c[ADAPTIVE].w);
+    double off = farthest(w, x, full, 0), way = farthest(w, full, t->x_t, 0);
+    return off > 0 ? off / way : 0;
+}
+
+static double best_of(const contest *t, int total) {
+    double best = INFINITY;
+    for (int k = 0; k < ADAPTIVE; k++) best = fmin(best, total ? t->c[k].total : t->c[k].seconds);
+    return best;
+}
+
+static void compare_row(const contest *t, int step, double error) {
+    const tss_step_info *f = &t->c[DIRECT].info, *a = &t->c[ADAPTIVE].info;
+    double share = a->nodes > 0 ? (double)a->enriched_nodes / a->nodes : 0;
+    fprintf(
+        t->csv,
+        "%d,%.10g,%.10g,%.6g,%.6g,%.6g,%.6g,%.6g,%d,%d,%.6g,%d,%d,%d,%d,%d,%d,%.6g,%.6g,%s,%s\n",
+        step, f->time, error, t->c[DIRECT].seconds, t->c[PCG].seconds, t->c[AUTO].seconds,
+        best_of(t, 0), t->c[ADAPTIVE].seconds, a->enriched_nodes, a->nodes, share, a->active_modes,
+        a->modes, f->newton, a->newton, f->contacts, a->contacts, f->residual_max, a->residual_max,
+        tss_status_text(f->status), tss_status_text(a->status));
+    fflush(t->csv);
+    printf("%6d %10.3e %9.4f %9.4f %9.4f %8.2f%% %6d %5d %5d %8d %10.3e %10.3e\n", step, error,
+           t->c[DIRECT].seconds, best_of(t, 0), t->c[ADAPTIVE].seconds, 100 * share,
+           a->active_modes, f->newton, a->newton, a->contacts, f->residual_max, a->residual_max);
+    fflush(stdout);
+}
+
+static int open_compare(run *r, contest *t) {
+    char path[700];
+    size_t wide = (size_t)tss_world_nodes(t->c[DIRECT].w) * (size_t)r->s.world.dim;
+    t->x_t = (double *)need(wide, sizeof(double)), t->x_free = (double *)need(wide, sizeof(double));
+    snprintf(path, sizeof path, "%s/compare.csv", r->o.out);
+    t->csv = fopen(path, "w");
+    if (!t->csv) return fail(r, "%s: cannot be written: %s", path, strerror(errno));
+    fputs(
+        "step,time,error,direct_s,pcg_s,auto_s,best_s,adaptive_s,enriched_nodes,nodes,"
+        "enriched_share,active_modes,modes,newton_full,newton_adaptive,contacts_full,"
+        "contacts_adaptive,residual_full,residual_adaptive,status_full,status_adaptive\n",
+        t->csv);
+    printf("%6s %10s %9s %9s %9s %9s %6s %5s %5s %8s %10s %10s\n", "step", "error", "direct s",
+           "best s", "adaptive", "enriched", "modes", "full", "adap.", "contacts", "res. full",
+           "res. adap.");
+    return 1;
+}
+
+// Part 1: every step from the same state. The direct solver's way is kept where the free steps end.
+static int compare_steps(run *r, contest *t) {
+    tss_world *direct = t->c[DIRECT].w;
+    size_t bytes = (size_t)tss_world_nodes(direct) * (size_t)r->s.world.dim * sizeof(double);
+    double started = now(NULL);
+    memcpy(t->x_free, tss_world_positions(direct), bytes);
+    for (int k = 1; k <= t->steps; k++) {
+        if (!compare_step(r, t, r->o.from + k)) return 0;
+        double error = step_error(t), spent = now(NULL) - started;
+        t->error = fmax(t->error, error);
+        t->failed += t->c[DIRECT].info.status != TSS_STEP_CONVERGED ||
+                     t->c[ADAPTIVE].info.status != TSS_STEP_CONVERGED;
+        compare_row(t, r->o.from + k, error);
+        if (k == t->free_steps) memcpy(t->x_free, tss_world_positions(direct), bytes);
+        fprintf(stderr, "compare: step %d of %d, %.0f s, about %.0f s left\n", k, t->steps, spent,
+                spent * (t->steps - k) / k);
+    }
+    for (int k = t->steps + 1; k <= t->free_steps; k++) {
+        if (!step_world(r, direct, r->o.from + k, &t->c[DIRECT].info)) return 0;
+        t->failed += t->c[DIRECT].info.status != TSS_STEP_CONVERGED;
+    }
+    if (t->free_steps > t->steps) memcpy(t->x_free, tss_world_positions(direct), bytes);
+    return 1;
+}
+
+// Part 2: the adaptive solver's own way. start, motions: from where part 1 began.
+static int compare_free(run *r, contest *t, const void *start, size_t size, void *motions,
+                        double *final) {
+    contender *a = &t->c[ADAPTIVE];
+    if (!load_world(r, a->w, start, size)) return 0;
+    load_motions(r, motions);
+    for (int k = 1; k <= t->free_steps; k++) {
+        if (!step_world(r, a->w, r->o.from + k, &a->info)) return 0;
+        t->failed += a->info.status != TSS_STEP_CONVERGED;
+        fprintf(stderr, "compare: free step %d of %d\n", k, t->free_steps);
+    }
+    *final = farthest(a->w, tss_world_positions(a->w), t->x_free, 1) / tss_world_diagonal(a->w);
+    return 1;
+}
+
+static int compare(run *r, contest *t) {
+    double final = 0;
+    size_t size;
+    t->steps = r->o.steps >= 0 ? r->o.steps : r->s.world.steps - r->o.from;
+    t->free_steps = r->o.free_steps >= 0 ? r->o.free_steps : t->steps;
+    if (t->steps < 1)
+        return fail(r, "%s: --from %d leaves no step to compare (the scene has %d)", r->o.scene,
+                    r->o.from, r->s.world.steps);
+    if (!build_contenders(r, t) || !make_folder(r, out_folder(r)) || !run_ahead(r, t) ||
+        !open_compare(r, t))
+        return 0;
+    void *start = save_world(t->c[ADAPTIVE].w, &size), *motions = save_motions(r);
+    int ok = compare_steps(r, t) && compare_free(r, t, start, size, motions, &final);
+    free(start), free(motions);
+    if (!ok) return 0;
+    printf("%d steps: direct %.3f s, pcg %.3f s, auto %.3f s, adaptive %.3f s; not converged: %d\n",
+           t->steps, t->c[DIRECT].total, t->c[PCG].total, t->c[AUTO].total, t->c[ADAPTIVE].total,
+           t->failed);
+    printf("error %.4g speedup %.4g best %.4g final %.4g\n", t->error,
+           t->c[DIRECT].total / t->c[ADAPTIVE].total, best_of(t, 1) / t->c[ADAPTIVE].total, final);
+    return 1;
+}
+
+static int command_compare(run *r) {
+    contest t;
+    memset(&t, 0, sizeof t);
+    int ok = read_scene(r) && compare(r, &t);
+    for (int k = 0; k < SOLVERS; k++) tss_world_destroy(t.c[k].w), free(t.c[k].kept);
+    if (t.csv) fclose(t.csv);
+    free(t.motions), free(t.x_t), free(t.x_free);
+    return !ok ? 2 : t.failed ? 3 : 0;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>modes
+// Each basis: a table, a contact sheet of its functions on the deformed body, and a .vtu with them.
+// ---------------------------------------------------------------------------------------------
+
+// What is drawn of a basis: a scalar function by its column of the second coordinate.
+typedef struct gallery {
+    tss_basis_info info;
+    int body, number, shown, stride, scalar;
+    double *u;  // shown × nodes × dim
+} gallery;
+
+static int open_gallery(run *r, int body, int number, gallery *g) {
+    const scene_body *b = &r->s.body[body];
+    int dim = r->s.world.dim, most = r->o.count > 0 ? r->o.count : 12;
+    memset(g, 0, sizeof *g);
+    if (tss_basis_get(r->w, b->basis[number].id, &g->info) != TSS_OK)
+        return fail(r, "%s: bodies[%d].basis[%d] is not there", r->o.scene, body, number);
+    g->body = body, g->number = number;
+    g->scalar = g->info.modes == dim * g->info.functions;
+    // Of weights times {1, X} the weights are shown.
+    int weights = b->basis[number].kind == TSS_BASIS_SKINNING && g->info.blocks > 0 &&
+                  g->info.functions % g->info.blocks == 0;
+    g->stride = weights ? g->info.functions / g->info.blocks : 1;
+    g->shown = g->info.functions / g->stride < most ? g->info.functions / g->stride : most;
+    size_t wide = (size_t)b->mesh.nodes * (size_t)dim;
+    g->u = (double *)need((size_t)g->shown * wide, sizeof(double));
+    for (int k = 0; k < g->shown; k++) {
+        int at = k * g->stride * (g->scalar ? dim : 1) + g->scalar;
+        if (tss_basis_mode(r->w, b->basis[number].id, at, g->u + (size_t)k * wide) != TSS_OK)
+            return fail(r, "%s: bodies[%d].basis[%d]: mode %d cannot be had", r->o.scene, body,
+                        number, at);
+    }
+    return 1;
+}
+
+static void print_gallery(const run *r, const gallery *g) {
+    const tss_basis_info *i = &g->info;
+    const scene_body *b = &r->s.body[g->body];
+    printf("bodies[%d].basis[%d] of %s: %s, %d nodes\n", g->body, g->number, b->name,
+           scene__bases[b->basis[g->number].kind], b->mesh.nodes);
+    printf("  blocks %d (%d active), functions %d, modes %d, residual %.3g, %.3f s, %.2f MB, %s\n",
+           i->blocks, i->active_blocks, i->functions, i->modes, i->residual, i->seconds,
+           1e-6 * (double)i->bytes, i->cached ? "cached" : "computed");
+    if (i->eigenvalue) printf("  %6s %14s\n", "block", "eigenvalue");
+    for (int k = 0; i->eigenvalue && k < i->blocks; k++)
+        printf("  %6d %14.6g\n", k, i->eigenvalue[k]);
+}
+
+// The body moved along u by at most an eighth of its box, coloured by u: the signed value of a
+// scalar function, the length of a vector. color: nodes.
+static void bend(const run *r, const gallery *g, const double *u, double *x, double *color) {
+    const tss_mesh *m = &r->s.body[g->body].mesh;
+    int dim = r->s.world.dim;
+    double lo[3], hi[3], size = 0, most = 0;
+    scene__box_empty(lo, hi);
+    scene__box(m->x, m->nodes, lo, hi);
+    for (int c = 0; c < 3; c++) size += (hi[c] - lo[c]) * (hi[c] - lo[c]);
+    for (int i = 0; i < m->nodes; i++) {
+        double s = 0;
+        for (int c = 0; c < dim; c++) s += u[dim * i + c] * u[dim * i + c];
+        most = fmax(most, sqrt(s));
+        color[i] = g->scalar ? u[dim * i + 1] : sqrt(s);
+    }
+    double scale = most > 0 ? 1 / most : 0;
+    for (int i = 0; i < m->nodes; i++) {
+        color[i] *= scale;
+        for (int c = 0; c < 3; c++)
+            x[3 * i + c] =
+                m->x[3 * i + c] + (c < dim ? 0.125 * sqrt(size) * scale * u[dim * i + c] : 0);
+    }
+}
+
+static view_camera body_camera(const run *r, int body) {
+    const tss_mesh *m = &r->s.body[body].mesh;
+    double lo[3], hi[3], size = 0;
+    scene__box_empty(lo, hi);
+    scene__box(m->x, m->nodes, lo, hi);
+    for (int c = 0; c < r->s.world.dim; c++) size = fmax(size, hi[c] - lo[c]);
+    for (int c = 0; c < r->s.world.dim; c++) lo[c] -= 0.15 * size, hi[c] += 0.15 * size;
+    return r->s.world.dim == 2
+               ? view_camera_fit_2d(lo, hi, r->s.frames.width, r->s.frames.height)
+               : view_camera_fit(lo, hi, r->s.camera.azimuth, r->s.camera.elevation,
+                                 r->s.camera.fov, VIEW_UP_Y, r->s.frames.width, r->s.frames.height);
+}
+
+// One picture; rgb NULL: no memory.
+static view_image draw_mode(run *r, const gallery *g, const double *u) {
+    const tss_mesh *m = &r->s.body[g->body].mesh;
+    int flat = r->s.world.dim == 2, first = r->skin_first[g->body];
+    int n = flat ? m->triangles : r->skin_first[g->body + 1] - first;
+    double *x = (double *)need(4 * (size_t)m->nodes, sizeof *x), *color = x + 3 * (size_t)m->nodes;
+    int *local = (int *)need(3 * (size_t)n, sizeof *local);
+    view_look look = flat ? view_look_2d() : view_look_default();
+    view_camera camera = body_camera(r, g->body);
+    view_style style = view_style_default();
+    bend(r, g, u, x, color);
+    for (int k = 0; k < 3 * n; k++)
+        local[k] =
+            flat ? m->triangle[k] : r->skin.triangle[3 * first + k] - r->s.body[g->body].first;
+    style.scalar = color, style.lo = g->scalar ? -1 : 0, style.hi = 1;
+    style.map = g->scalar ? VIEW_MAP_BALANCE : VIEW_MAP_SEA, style.wire = 0.15f;
+    look.ground = 0;
+    view_begin(r->view, &camera, &look);
+    view_add_mesh(r->view, x, m->nodes, local, n, &style);
+    view_image im = view_render(r->view), small = {0, 0, NULL};
+    if (im.rgb) small = view_image_shrink(&im, im.width / 2);
+    free(x), free(local);
+    return small;
+}
+
+static int draw_gallery(run *r, const gallery *g) {
+    size_t wide = (size_t)r->s.body[g->body].mesh.nodes * (size_t)r->s.world.dim;
+    view_image *im = (view_image *)need((size_t)g->shown, sizeof *im), sheet = {0, 0, NULL};
+    char(*text)[60] = (char(*)[60])need((size_t)g->shown, sizeof *text), path[700];
+    const char **label = (const char **)need((size_t)g->shown, sizeof *label);
+    view_error why = {""};
+    int ok = 1;
+    for (int k = 0; ok && k < g->shown; k++) {
+        im[k] = draw_mode(r, g, g->u + (size_t)k * wide);
+        ok = im[k].rgb != NULL;
+        snprintf(text[k], sizeof *text, "function %d", k * g->stride);
+        if (g->info.eigenvalue && g->info.functions == g->stride * g->info.blocks)
+            snprintf(text[k], sizeof *text, "block %d, eigenvalue %.4g", k, g->info.eigenvalue[k]);
+        label[k] = text[k];
+    }
+    snprintf(path, sizeof path, "%s/modes_%d_%d.png", r->o.out, g->body, g->number);
+    if (ok) sheet = view_image_sheet(im, g->shown, g->shown < 4 ? g->shown : 4, 6, label);
+    ok = sheet.rgb != NULL && view_write_png(path, &sheet, &why);
+    for (int k = 0; k < g->shown; k++) view_image_free(&im[k]);
+    view_image_free(&sheet);
+    free(im), free(text), free((void *)label);
+    return ok ? 1 : fail(r, "%s", why.message[0] ? why.message : "out of memory for a picture");
+}
+
+static int write_gallery(run *r, const gallery *g) {
+    const tss_mesh *m = &r->s.body[g->body].mesh;
+    size_t wide = (size_t)m->nodes * (size_t)r->s.world.dim;
+    tss_field *f = (tss_field *)need((size_t)g->shown, sizeof *f);
+    char(*name)[40] = (char(*)[40])need((size_t)g->shown, sizeof *name), path[700];
+    tss_io_error why;
+    for (int k = 0; k < g->shown; k++) {
+        snprintf(name[k], sizeof *name, "function %04d", k * g->stride);
+        f[k].name = name[k], f[k].values = g->u + (size_t)k * wide;
+        f[k].components = r->s.world.dim;
+    }
+    snprintf(path, sizeof path, "%s/modes_%d_%d.vtu", r->o.out, g->body, g->number);
+    int ok = tss_mesh_write_vtu(m, m->x, path, f, g->shown, 0, &why) == TSS_OK;
+    free(f), free(name);
+    return ok ? 1 : fail(r, "%s: %s", why.file, why.message);
+}
+
+static int command_modes(run *r) {
+    if (!read_scene(r)) return 2;
+    if (!has_bases(&r->s)) return fail(r, "%s: no body has a basis", r->o.scene), 2;
+    if (scene_mode(&r->s) == TSS_MODE_FULL) r->s.solver.mode = TSS_MODE_SUBSPACE;
+    r->s.frames.field = SCENE_FIELD_NONE, r->png = 1, r->vtu = r->obj = 0;
+    if (!build_world(r, &r->w, &r->ipc) || !make_folder(r, out_folder(r)) || !open_frames(r))
+        return 2;
+    for (int b = 0; b < r->s.bodies; b++)
+        for (int k = 0; k < r->s.body[b].bases; k++) {
+            gallery g;
+            int ok = open_gallery(r, b, k, &g);
+            if (ok) print_gallery(r, &g);
+            ok = ok && draw_gallery(r, &g) && write_gallery(r, &g);
+            free(g.u);
+            if (!ok) return 2;
+        }
+    return 0;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>main
+// ---------------------------------------------------------------------------------------------
+
 int main(int argc, char **argv) {
     static run r;
     if (argc >= 2 && strcmp(argv[1], "--version") == 0) return version();
     if (argc >= 2 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0))
         return usage(stdout);
-    if (argc < 2 || (strcmp(argv[1], "run") != 0 && strcmp(argv[1], "check") != 0))
-        return usage(stderr);
+    static const struct {
+        const char *name;
+        int (*run)(run *r);
+    } commands[] = {{"run", command_run},
+                    {"check", command_check},
+                    {"compare", command_compare},
+                    {"modes", command_modes}};
+    int which = 0;
+    while (which < 4 && argc >= 2 && strcmp(argv[1], commands[which].name) != 0) which++;
+    if (argc < 2 || which == 4) return usage(stderr);
     if (!read_options(argc, argv, &r.o)) return 2;
-    int code = strcmp(r.o.command, "run") == 0 ? command_run(&r) : command_check(&r);
+    int code = commands[which].run(&r);
     if (r.why.text[0]) fprintf(stderr, "tss: %s\n", r.why.text);
     run_free(&r);
     return code;

@@ -16,7 +16,7 @@
    if (!view_write_png("frame.png", &im, &why)) fprintf(stderr, "%s\n", why.message);
    view_destroy(v);
 
-   WHAT IT DRAWS  Triangle meshes (one colour, or a scalar through a colour map; thin mesh edges),
+   WHAT IT DRAWS  Triangle meshes (one colour, darkened by a scalar or chosen by it; mesh edges),
    segments as tubes, points as balls, a ground plane with a grid that fades out; text, a colour
    bar, contact sheets. A key light with soft shadows (harder near contact), a fill light, a sky,
    ambient occlusion; 2D meshes unlit, seen from above.
@@ -99,6 +99,7 @@ typedef struct view_style {
     const double *scalar;  // one a node, through map; NULL: colour. Not finite: grey
     double lo, hi;         // the scalars at the map's ends
     view_map map;
+    float darken;   // > 0: the scalar darkens colour by up to this share, instead of map; 0..1
     double crease;  // smooth shading across edges bent less than this; 0: flat facets
     float wire;     // opacity of the mesh edges, 0..1
     float wire_colour[3];
@@ -216,7 +217,7 @@ static const float view__sample[VIEW__SAMPLES][2] = {
 
 // One surface's look, in linear light.
 typedef struct view__object {
-    float colour[3], wire_colour[3], wire;
+    float colour[3], wire_colour[3], wire, darken;
     int mapped, map, gloss;
 } view__object;
 
@@ -613,6 +614,7 @@ static int view__add_object(view *v, const view_style *s, int gloss) {
     view__linear3(s->wire_colour, o->wire_colour);
     o->wire = view__clamp(s->wire, 0, 1);
     o->mapped = s->scalar != NULL, o->gloss = gloss;
+    o->darken = view__clamp(s->darken, 0, 1);
     o->map = (unsigned)s->map < VIEW_MAP_COUNT ? (int)s->map : 0;
     return (int)v->objects++;
 }
@@ -1499,6 +1501,8 @@ static void view__albedo(const view *v, const view__object *o, const int *t, con
         c[0] = c[1] = c[2] = 0.32f;
         return;
     }
+    for (int i = 0; i < 3 && o->darken > 0; i++) c[i] *= 1 - o->darken * (s < 1 ? s : 1);
+    if (o->darken > 0) return;
     float f = 256 * (s < 1 ? s : 1);
     int k = f < 255 ? (int)f : 255;
     for (int i = 0; i < 3; i++)

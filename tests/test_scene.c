@@ -2,6 +2,7 @@
 #define TSS_IMPLEMENTATION
 #include "tss.h"
 #include "tss_ipc.h"
+#include "tss_subspace.h"
 #include "tss_io.h"
 #include "tss_shapes.h"
 #define SCENE_IMPLEMENTATION
@@ -147,6 +148,7 @@ static void test_refusals(void **state) {
             "keyframes[1].time", "more than");
     refused("{\"planes\": [{\"normal\": [0, 0, 0]}]}", "planes[0].normal", "direction");
     refused("{\"frames\": {\"size\": [8, 8]}}", "frames.size", "pixels");
+    refused("{\"frames\": {\"field\": \"eror\"}}", "frames.field", "did you mean \"error\"?");
 }
 
 static void test_set(void **state) {
@@ -602,6 +604,339 @@ static void test_two_dimensions(void **state) {
     refused("{\"world\": {\"dim\": 2}, \"bodies\": [{" BOX "}]}", "bodies[0]", "z = ");
 }
 
+// ---------------------------------------------------------------------------------------------
+
+static void test_subspace_values(void **state) {
+    scene s;
+    tss_subspace_def d = tss_subspace_def_default();
+    (void)state;
+    read_ok(&s, "{\"bodies\": [{" BOX "}]}");
+    assert_int_equal(scene_mode(&s), TSS_MODE_FULL);
+    assert_true(s.solver.error_nodes == d.error_nodes && s.solver.error_modes == d.error_modes &&
+                s.solver.progress == d.progress && s.solver.downdate == d.downdate);
+    assert_true(s.solver.keep == d.keep && s.solver.partitions == d.partitions);
+    scene_free(&s);
+    read_ok(&s,
+            "{\"solver\": {\"error_nodes\": 0.1, \"error_modes\": 0.2, \"progress\": 0.3,"
+            "\"downdate\": 0.4, \"keep\": 5, \"partitions\": 6, \"oracle\": \"literal\","
+            "\"secant\": \"exact\", \"schur\": \"direct\", \"newton_residual\": true},"
+            "\"bodies\": [{" BOX ", \"basis\": {\"kind\": \"affine\"}}]}");
+    tss_subspace_def u = scene__subspace_def(&s);
+    assert_int_equal(scene_mode(&s), TSS_MODE_ADAPTIVE);
+    assert_true(u.error_nodes == 0.1 && u.error_modes == 0.2 && u.progress == 0.3 &&
+                u.downdate == 0.4);
+    assert_true(u.keep == 5 && u.partitions == 6 && u.mode == TSS_MODE_ADAPTIVE);
+    assert_true(u.oracle == TSS_ORACLE_LITERAL && u.secant == TSS_SECANT_EXACT &&
+                u.schur == TSS_SCHUR_DIRECT);
+    assert_true(scene__world_def(&s, NULL).newton_residual == 1);
+    assert_int_equal(s.bodies, 1);
+    assert_int_equal(s.body[0].bases, 1);
+    scene_free(&s);
+}
+
+static void test_mode_words(void **state) {
+    static const char *const mode[] = {"adaptive", "subspace", "full"};
+    char text[100];
+    scene s;
+    (void)state;
+    for (int k = 0; k < 3; k++) {
+        snprintf(text, sizeof text, "{\"solver\": {\"mode\": \"%s\"}}", mode[k]);
+        read_ok(&s, text);
+        assert_int_equal(scene_mode(&s), k);
+        scene_free(&s);
+    }
+    assert_true(TSS_MODE_ADAPTIVE == 0 && TSS_MODE_SUBSPACE == 1 && TSS_MODE_FULL == 2);
+}
+
+#define BASIS(keys) "{\"bodies\": [{" BOX ", \"basis\": " keys "}]}"
+
+static void test_basis_values(void **state) {
+    scene s;
+    (void)state;
+    read_ok(&s, BASIS("[{\"kind\": \"skinning\", \"count\": 3, \"heterogeneous\": true,"
+                      "\"initial\": -1, \"cache\": \"a.modes\", \"tol\": 1e-5},"
+                      "{\"kind\": \"eigen\", \"count\": 20}, {\"kind\": \"quadratic\"},"
+                      "{\"kind\": \"biharmonic\", \"count\": 8}]"));
+    const scene_basis *b = s.body[0].basis;
+    assert_int_equal(s.body[0].bases, 4);
+    tss_basis_def d = scene__basis_def(b), own = tss_basis_skinning(3);
+    assert_true(d.kind == TSS_BASIS_SKINNING && d.count == 3 && d.heterogeneous == 1 &&
+                d.initial == -1 && d.tol == 1e-5 && strcmp(d.cache, "a.modes") == 0);
+    assert_true(d.cookie == own.cookie && own.initial == tss_basis_skinning(3).initial);
+    d = scene__basis_def(b + 1);
+    assert_true(d.kind == TSS_BASIS_EIGEN && d.count == 20 && !d.cache && d.tol == 1e-8);
+    assert_int_equal(scene__basis_def(b + 2).kind, TSS_BASIS_QUADRATIC);
+    assert_int_equal(scene__basis_def(b + 3).kind, TSS_BASIS_BIHARMONIC);
+    scene_free(&s);
+    read_ok(&s, BASIS("{\"kind\": \"pod\", \"snapshots\": [\"a.snp\", \"b.snp\"]}"));
+    assert_int_equal(s.body[0].basis[0].snapshots, 2);
+    assert_string_equal(s.body[0].basis[0].snapshot[1], "b.snp");
+    assert_int_equal(s.body[0].basis[0].count, 16);
+    scene_free(&s);
+}
+
+static void test_basis_refusals(void **state) {
+    (void)state;
+    refused("{\"solver\": {\"mode\": \"adaptiv\"}}", "solver.mode", "did you mean \"adaptive\"?");
+    refused("{\"solver\": {\"oracle\": \"delphi\"}}", "solver.oracle", "ring");
+    refused("{\"solver\": {\"secant\": \"sr1\"}}", "solver.secant", "bfgs");
+    refused("{\"solver\": {\"schur\": \"dirct\"}}", "solver.schur", "did you mean \"direct\"?");
+    refused("{\"solver\": {\"error_nodes\": -1}}", "solver.error_nodes", ">= 0");
+    refused("{\"solver\": {\"error_modes\": true}}", "solver.error_modes", "a number");
+    refused("{\"solver\": {\"progress\": -1e-9}}", "solver.progress", ">= 0");
+    refused("{\"solver\": {\"downdate\": -1}}", "solver.downdate", ">= 0");
+    refused("{\"solver\": {\"keep\": 1.5}}", "solver.keep", "whole");
+    refused("{\"solver\": {\"partitions\": -1}}", "solver.partitions", "whole");
+    refused("{\"solver\": {\"newton_residual\": 1}}", "solver.newton_residual", "true or false");
+    refused(BASIS("3"), "bodies[0].basis is 3", "{ }");
+    refused(BASIS("{}"), "bodies[0].basis.kind is missing", NULL);
+    refused(BASIS("[{\"kind\": \"affine\"}, {\"kind\": \"skining\"}]"), "bodies[0].basis[1].kind",
+            "did you mean \"skinning\"?");
+    refused(BASIS("{\"kind\": \"skinning\", \"handles\": 3}"), "bodies[0].basis.handles",
+            "no such key");
+    refused(BASIS("{\"kind\": \"affine\", \"count\": 3}"), "bodies[0].basis.count", "no meaning");
+    refused(BASIS("{\"kind\": \"eigen\", \"heterogeneous\": true}"),
+            "bodies[0].basis.heterogeneous", "no meaning");
+    refused(BASIS("{\"kind\": \"biharmonic\", \"tol\": 1}"), "bodies[0].basis.tol", "no meaning");
+    refused(BASIS("{\"kind\": \"skinning\", \"snapshots\": \"a\"}"), "basis.snapshots",
+            "no meaning");
+    refused(BASIS("{\"kind\": \"skinning\", \"count\": 0}"), "bodies[0].basis.count is 0",
+            "from 1");
+    refused(BASIS("{\"kind\": \"skinning\", \"initial\": -2}"), "basis.initial", "from -1");
+    refused(BASIS("{\"kind\": \"skinning\", \"tol\": 0}"), "basis.tol", "> 0");
+    refused(BASIS("{\"kind\": \"skinning\", \"cache\": 3}"), "basis.cache", "a text");
+    refused(BASIS("{\"kind\": \"pod\"}"), "basis.snapshots is missing", "tss run");
+    refused(BASIS("{\"kind\": \"pod\", \"snapshots\": [3]}"), "basis.snapshots[0]", "file name");
+    // a cube of 8 nodes
+    refused(BASIS("[{\"kind\": \"skinning\", \"count\": 9}]"), "basis[0].count is 9", "at most 8");
+    refused(BASIS("[{\"kind\": \"eigen\", \"count\": 25}]"), "basis[0].count is 25", "at most 24");
+    refused("{\"bodies\": [{" BOX ", \"obstacle\": true, \"basis\": {\"kind\": \"affine\"}}]}",
+            "bodies[0].basis", "obstacle");
+}
+
+// The message must hold both parts, and no world is left.
+static void not_built(const char *text, const char *part, const char *part2) {
+    scene s;
+    scene_error e;
+    tss_world *w;
+    read_ok(&s, text);
+    if (scene_build(&s, NULL, NULL, NULL, &w, NULL, &e)) fail_msg("was built: %s", text);
+    assert_null(w);
+    if (!strstr(e.text, part) || !strstr(e.text, part2) || !strstr(e.text, "t.json"))
+        fail_msg("\"%s\" does not say \"%s\" and \"%s\"", e.text, part, part2);
+    scene_free(&s);
+}
+
+static void write_bytes(const char *path, const void *data, size_t size) {
+    FILE *f = fopen(path, "wb");
+    assert_non_null(f);
+    assert_true(fwrite(data, 1, size, f) == size);
+    fclose(f);
+}
+
+#define POD BASIS("{\"kind\": \"pod\", \"snapshots\": \"scene_x.snp\"}")
+
+// The file as its banner says: magic, nodes, dim, count, then the positions, step by step.
+static void test_snapshots(void **state) {
+    scene s;
+    scene_error e;
+    uint64_t head[4];
+    double x[2][24], kept[2][24];
+    (void)state;
+    read_ok(&s, "{\"bodies\": [{" BOX "}]}");
+    tss_world *w = build(&s);
+    for (int k = 0; k < 2; k++) {
+        steps(&s, w, 1);
+        memcpy(x[k], tss_world_positions(w), sizeof x[k]);
+        if (!scene_snapshot("scene_x.snp", w, k, &e)) fail_msg("%s", e.text);
+    }
+    FILE *f = fopen("scene_x.snp", "rb");
+    assert_non_null(f);
+    assert_true(fread(head, sizeof head, 1, f) == 1 && fread(kept, sizeof kept, 1, f) == 1);
+    assert_true(fgetc(f) == EOF);
+    fclose(f);
+    assert_memory_equal(head, "tss snp1", 8);
+    assert_true(head[1] == 8 && head[2] == 3 && head[3] == 2);
+    assert_memory_equal(kept, x, sizeof x);
+    assert_false(scene_snapshot("no/such/folder.snp", w, 0, &e));
+    assert_non_null(strstr(e.text, "no/such/folder.snp"));
+    tss_world_destroy(w);
+    scene_free(&s);
+    // In full mode no basis is made, and the file is not looked for.
+    remove("scene_x.snp");
+    not_built(POD, "bodies[0].basis[0].snapshots[0]", "scene_x.snp cannot be read");
+    read_ok(&s, "{\"solver\": {\"mode\": \"full\"}, \"bodies\": [{" BOX
+                ", \"basis\": {\"kind\": "
+                "\"pod\", \"snapshots\": \"scene_x.snp\"}}]}");
+    w = build(&s);
+    assert_null(tss_subspace_of(w));
+    tss_world_destroy(w);
+    scene_free(&s);
+}
+
+// Snapshots of a space of three dimensions (the translations) give three modes.
+static void test_pod(void **state) {
+    scene s;
+    scene_error e;
+    tss_basis_info info;
+    double moved[24];
+    (void)state;
+    read_ok(&s, "{\"contact\": {\"enabled\": false}, \"bodies\": [{" BOX "}]}");
+    tss_world *w = build(&s);
+    for (int k = 0; k < 5; k++) {
+        for (int i = 0; i < 24; i++) moved[i] = tss_world_rest(w)[i] + (k + 1) * (i % 3 == k % 3);
+        assert_int_equal(tss_body_teleport(w, s.body[0].id, moved, NULL), TSS_OK);
+        if (!scene_snapshot("scene_x.snp", w, k, &e)) fail_msg("%s", e.text);
+    }
+    tss_world_destroy(w);
+    scene_free(&s);
+    read_ok(&s, POD);
+    w = build(&s);
+    assert_int_equal(tss_basis_get(w, s.body[0].basis[0].id, &info), TSS_OK);
+    assert_int_equal(info.kind, TSS_BASIS_POD);
+    assert_int_equal(info.functions, 3);
+    tss_world_destroy(w);
+    scene_free(&s);
+    remove("scene_x.snp");
+}
+
+static void test_snapshot_refusals(void **state) {
+    struct {
+        char magic[8];
+        uint64_t nodes, dim, count;
+        double x[48];
+    } f;
+    const char *key = "bodies[0].basis[0].snapshots[0]";
+    (void)state;
+    memset(&f, 0, sizeof f);
+    memcpy(f.magic, "tss snp1", 8);
+    f.nodes = 8, f.dim = 3, f.count = 2;
+    write_bytes("scene_x.snp", &f, sizeof f - 8);
+    not_built(POD, key, "ends in snapshot 2 of 2");
+    write_bytes("scene_x.snp", &f, 20);
+    not_built(POD, key, "is no file that");
+    f.count = 0, write_bytes("scene_x.snp", &f, sizeof f);
+    not_built(POD, key, "0 snapshots");
+    f.count = 2, f.nodes = 9, write_bytes("scene_x.snp", &f, sizeof f);
+    not_built(POD, key, "9 nodes in 3 dimensions, this scene has 8 in 3");
+    f.nodes = 8, f.dim = 2, write_bytes("scene_x.snp", &f, sizeof f);
+    not_built(POD, key, "8 nodes in 2 dimensions");
+    f.dim = 3, f.magic[0] = 'T', write_bytes("scene_x.snp", &f, sizeof f);
+    not_built(POD, key, "is no file that");
+    remove("scene_x.snp");
+    not_built("{\"solver\": {\"mode\": \"subspace\"}, \"bodies\": [{" BOX "}]}", "solver.mode",
+              "no body has a basis");
+}
+
+// Masses against densities times volumes; Lamé parameters against the formulas of E and nu.
+static void test_regions(void **state) {
+    scene s;
+    double sum = 0, mu, lambda, rho;
+    (void)state;
+    read_ok(&s,
+            "{\"bodies\": [{\"shape\": {\"kind\": \"box\", \"cells\": [4, 2, 2]}, \"regions\": ["
+            "{\"upper\": [0.5, 1, 1], \"material\": {\"rho\": 3000, \"E\": 7}},"
+            "{\"upper\": [-0.25, 1, 1], \"metres\": true, \"material\": {\"nu\": 0.25}}],"
+            "\"material\": {\"rho\": 1000, \"E\": 10, \"nu\": 0}}]}");
+    tss_world *w = build(&s);
+    for (int i = 0; i < tss_world_nodes(w); i++) sum += tss_world_masses(w)[i];
+    // a quarter of the cube is in both regions, and the later one has the body's density
+    near_to(sum, 0.25 * 1000 + 0.25 * 3000 + 0.5 * 1000, 1e-9);
+    const int *cell = tss_body_cells(w, 0);
+    for (int k = 0; k < s.body[0].mesh.tets; k++) {
+        double x = 0;
+        for (int c = 0; c < 4; c++) x += tss_world_rest(w)[3 * cell[4 * k + c]] / 4;
+        double E = x < -0.25 || x > 0 ? 10 : 7, nu = x < -0.25 ? 0.25 : 0;
+        assert_int_equal(tss_body_cell_material(w, 0, k, &mu, &lambda, &rho), TSS_OK);
+        near_to(mu, E / (2 * (1 + nu)), 1e-12);
+        near_to(lambda, E * nu / ((1 + nu) * (1 - 2 * nu)), 1e-12);
+        near_to(rho, x < -0.25 || x > 0 ? 1000 : 3000, 1e-9);
+    }
+    tss_world_destroy(w);
+    scene_free(&s);
+    refused("{\"bodies\": [{" BOX ", \"regions\": [{\"lower\": [2, 2, 2], \"material\": {}}]}]}",
+            "bodies[0].regions[0]", "no cell");
+    refused("{\"bodies\": [{" BOX ", \"regions\": [{}]}]}", "regions[0].material is missing", NULL);
+    refused("{\"bodies\": [{" BOX ", \"regions\": [{\"material\": {\"kind\": \"stvk\"}}]}]}",
+            "regions[0].material.kind", "no such key");
+    refused("{\"bodies\": [{" BOX ", \"regions\": [{\"material\": {\"nu\": 0.5}}]}]}",
+            "regions[0].material.nu", "0.4999");
+    refused("{\"bodies\": [{" BOX ", \"regions\": {}}]}", "bodies[0].regions", "[ ]");
+    refused("{\"bodies\": [{" BOX ", \"obstacle\": true, \"regions\": [{\"material\": {}}]}]}",
+            "bodies[0].regions", "obstacle");
+}
+
+// A script's bodies get theirs by --set; its moving nodes are scripted before the basis is made.
+static void test_script_basis(void **state) {
+    static const char *const set[] = {"bodies.0.basis={\"kind\": \"skinning\", \"count\": 2}"};
+    static const char *const many[] = {"bodies.0.basis={\"kind\": \"skinning\", \"count\": 20}"};
+    const char *text = "shapes input 2\n" CUBE(0, 0, 0) "\n" CUBE(3, 0, 0) "\nscript twist\n";
+    scene s;
+    scene_error e;
+    (void)state;
+    if (!scene_parse(&s, "t.txt", text, NULL, set, 1, &e)) fail_msg("%s", e.text);
+    assert_int_equal(s.body[0].bases, 1);
+    assert_int_equal(scene_mode(&s), TSS_MODE_ADAPTIVE);
+    tss_world *w = build(&s);
+    int scripted = 0;
+    for (int i = 0; i < 8; i++) scripted += tss_world_kinds(w)[i] == TSS_NODE_SCRIPTED;
+    assert_int_equal(scripted, 4);  // the left side
+    tss_world_destroy(w);
+    scene_free(&s);
+    assert_false(scene_parse(&s, "t.txt", text, NULL, many, 1, &e));
+    assert_non_null(strstr(e.text, "bodies[0].basis[0].count is 20"));
+}
+
+#define SOFT                                                                                     \
+    "\"world\": {\"dt\": 0.02}, \"bodies\": [{\"shape\": {\"kind\": \"box\", \"cells\": 3},"     \
+    "\"translate\": [0, 0.51, 0], \"material\": {\"E\": 2e4}, \"pins\": [{\"upper\": [0, 1, 1]," \
+    "\"release\": true, \"motion\": {\"velocity\": [0, 1, 0], \"end\": 0.06}}],"                 \
+    "\"forces\": [{\"acceleration\": [3, 0, 0], \"start\": 0.02, \"end\": 0.05}],"               \
+    "\"basis\": {\"kind\": \"affine\"}}], \"planes\": [{}]}"
+
+// With an error bound of 0 every node is enriched: the full-space solver's way, within tolerance.
+static void test_adaptive_at_zero(void **state) {
+    scene a, f;
+    double most = 0;
+    (void)state;
+    read_ok(&a,
+            "{\"solver\": {\"error_nodes\": 0, \"error_modes\": 0, \"progress\": 1e9, \"tol\": "
+            "1e-7}," SOFT);
+    read_ok(&f, "{\"solver\": {\"mode\": \"full\", \"tol\": 1e-7}," SOFT);
+    tss_world *wa = build(&a), *wf = build(&f);
+    assert_non_null(tss_subspace_of(wa));
+    assert_null(tss_subspace_of(wf));
+    steps(&a, wa, 6), steps(&f, wf, 6);
+    for (int i = 0; i < 3 * tss_world_nodes(wa); i++)
+        most = fmax(most, fabs(tss_world_positions(wa)[i] - tss_world_positions(wf)[i]));
+    near_to(most, 0, 1e-6);
+    tss_world_destroy(wa), tss_world_destroy(wf);
+    scene_free(&a), scene_free(&f);
+}
+
+// One scene, two worlds in turn, against two scenes with a world each.
+static void test_two_worlds(void **state) {
+    const char *text = "{\"solver\": {\"mode\": \"full\"}," SOFT;
+    scene s, one;
+    (void)state;
+    read_ok(&s, text), read_ok(&one, text);
+    tss_world *w = build(&s), *u = build(&s), *alone = build(&one);
+    size_t size = scene_state(&s, NULL, 0, 1);
+    void *before = malloc(size);
+    for (int k = 0; k < 6; k++) {
+        assert_true(scene_state(&s, before, size, 1) == size);
+        steps(&s, w, 1);
+        assert_true(scene_state(&s, before, size, 0) == size);
+        steps(&s, u, 1);
+    }
+    steps(&one, alone, 6);
+    assert_true(tss_world_hash(w) == tss_world_hash(alone));
+    assert_true(tss_world_hash(u) == tss_world_hash(alone));
+    free(before);
+    tss_world_destroy(w), tss_world_destroy(u), tss_world_destroy(alone);
+    scene_free(&s), scene_free(&one);
+}
+
 int main(void) {
     const struct CMUnitTest tests[] = {cmocka_unit_test(test_defaults),
                                        cmocka_unit_test(test_values),
@@ -624,6 +959,17 @@ int main(void) {
                                        cmocka_unit_test(test_script_dragright),
                                        cmocka_unit_test(test_script_boundary),
                                        cmocka_unit_test(test_script_refusals),
-                                       cmocka_unit_test(test_two_dimensions)};
+                                       cmocka_unit_test(test_two_dimensions),
+                                       cmocka_unit_test(test_subspace_values),
+                                       cmocka_unit_test(test_mode_words),
+                                       cmocka_unit_test(test_basis_values),
+                                       cmocka_unit_test(test_basis_refusals),
+                                       cmocka_unit_test(test_snapshots),
+                                       cmocka_unit_test(test_pod),
+                                       cmocka_unit_test(test_snapshot_refusals),
+                                       cmocka_unit_test(test_regions),
+                                       cmocka_unit_test(test_script_basis),
+                                       cmocka_unit_test(test_adaptive_at_zero),
+                                       cmocka_unit_test(test_two_worlds)};
     return cmocka_run_group_tests(tests, with_meshes, without_meshes);
 }
