@@ -2423,10 +2423,10 @@ typedef struct tss__sub_cross {  // H between two bodies b < c, a_c × a_b colum
     size_t at;
 } tss__sub_cross;
 
-typedef struct tss__sub_jrow {  // one enriched node's row of J towards one body
-    int x, body;
-    size_t at;
-} tss__sub_jrow;
+typedef struct tss__sub_jlink {  // a block of K between an enriched and a border node
+    int other;
+    const double *block;
+} tss__sub_jlink;
 
 typedef struct tss__sub_counts {
     int linear_iterations, factorizations;
@@ -2477,8 +2477,9 @@ struct tss_subspace {
     tss_bcsr Ax, Cx;                                     // H_x = Ax + Cx
     uint64_t xpattern, x_stamp, x_from[2];               // pattern numbers; changes of the enriched set
     int masked;                                          // some enriched node has fixed axes
-    tss__sub_buf jrow, jval;                             // J: tss__sub_jrow; their d × a values
-    int jrows;
+    tss__sub_buf border, border_index, border_ptr, border_link, border_u;  // J: see >>enriched_solve
+    tss__sub_buf x_ptr, x_link;
+    int borders;
     size_t modes;                                        // Σ a
     tss__sub_buf small, small_work, small_rhs, factors;  // small dense matrices and vectors
     tss__sub_buf modal_work, columns, pair_key;
@@ -3576,7 +3577,7 @@ static void tss__sub_bfgs_task(int p, int worker, void *arg) {
         int i = j + 1;
         tss__sub_axpy(a - j, step[j], col + j, Hs + j);
         for (; i + 4 <= a; i += 4)
-            for (int t = 0; t < 4; t++) sum[t] += col[i + t] * step[i + t];
+            for (int l = 0; l < 4; l++) sum[l] += col[i + l] * step[i + l];
         for (; i < a; i++) sum[0] += col[i] * step[i];
         Hs[j] += (sum[0] + sum[1]) + (sum[2] + sum[3]);
         y[j] = g1[j] - g0[j];
@@ -4294,8 +4295,10 @@ static tss_result tss__sub_modal_apply(tss_subspace *s, int mask, const double *
 // >>enriched_solve (private)
 // The Schur complement of Eq. (21)–(22), with the right-hand side as elimination gives it:
 //     (H_x − J H_q⁻¹Jᵀ) d_x = r_x − J H_q⁻¹ r_q,   d_q = H_q⁻¹ (r_q − Jᵀ d_x),   r = −g,
-// J here the rows K_xq U of enriched nodes (the transpose of the paper's). J is stored dense, only for
-// enriched nodes that share a stencil with a node that is not. Either conjugate gradients with the
+// J = K_xq U here the rows of enriched nodes (the transpose of the paper's). It is kept as its two
+// factors: the blocks of K between enriched nodes and the modal nodes they share a stencil with, and
+// those nodes' rows of U. A product costs d · c a modal node in place of d · a an enriched one, and
+// the rows stay in the cache. Either conjugate gradients with the
 // blocks of H_x's diagonal as preconditioner, or a sparse Cholesky of H_x and the dense complement
 // H_q − JᵀH_x⁻¹J; the choice is by counted work, as in >>linear of tss.h. Nothing enriched: no solve.
 // ---------------------------------------------------------------------------------------------
@@ -4347,49 +4350,79 @@ static tss_result tss__sub_extract(tss_subspace *s, const tss_unknowns *u, const
     return TSS_OK;
 }
 
-// J: for each body the enriched rows that couple to its modal nodes, d × a each.
-typedef struct tss__sub_jrun {
-    tss_subspace *s;
-    const tss_unknowns *u;
-} tss__sub_jrun;
-
-static void tss__sub_couple_task(int k, int worker, void *arg) {
-    const tss__sub_jrun *run = (const tss__sub_jrun *)arg;
-    const tss_subspace *s = run->s;
-    const tss__sub_jrow *j = (const tss__sub_jrow *)s->jrow.p + k;
-    double *T = tss__sub_f(&s->jval) + j->at;
-    (void)worker;
-    memset(T, 0, (size_t)(s->dim * tss__sub_modal(s, j->body)->a) * sizeof(double));
-    tss__sub_times_row(s, run->u, run->u->row[tss__sub_i(&s->xnode)[j->x]], j->body, 1, T);
-}
-
-static tss_result tss__sub_build_J(tss_subspace *s, const tss_unknowns *u) {
-    size_t at = 0;
-    s->jrows = 0;
-    for (int i = 0; i < s->xrows; i++) {
-        int row = u->row[tss__sub_i(&s->xnode)[i]], from = s->jrows;
-        for (int part = 0; part < 2; part++) {
-            const tss_bcsr *K = part ? &s->C : &s->A;
-            if (!part && !tss__sub_u(&s->live_row)[row]) continue;
-            for (int64_t q = K->row[row]; q < K->row[row + 1]; q++) {
-                int j = u->node[K->col[q]], body = tss__sub_i(&s->body_of)[j], known = 0;
-                if (body < 0 || tss__sub_u(&s->on)[j] || tss__sub_modal(s, body)->a == 0) continue;
-                for (int k = from; k < s->jrows; k++) known |= ((tss__sub_jrow *)s->jrow.p)[k].body == body;
-                if (known) continue;
-                tss__sub_jrow *list = (tss__sub_jrow *)tss__sub_need(s, &s->jrow, (size_t)s->jrows + 1, sizeof *list);
-                if (!list) return tss__sub_no_memory(s);
-                list[s->jrows].x = i, list[s->jrows].body = body, list[s->jrows++].at = at;
-                at += (size_t)(s->dim * tss__sub_modal(s, body)->a);
-            }
-        }
-    }
-    if (!tss__sub_need(s, &s->jval, at, sizeof(double))) return tss__sub_no_memory(s);
-    tss__sub_jrun run = {s, u};
-    tss_parallel(&s->host, s->jrows, tss__sub_couple_task, &run);
+// Modal nodes that share a block with an enriched one ("border"), body by body, and the blocks of K
+// between the two, by border node (K_qx) and by enriched node (K_xq).
+static tss_result tss__sub_link(tss_subspace *s, int *count, tss__sub_buf *list, int other, const double *blk) {
+    tss__sub_jlink *l = (tss__sub_jlink *)tss__sub_need(s, list, (size_t)*count + 1, sizeof *l);
+    if (!l) return tss__sub_no_memory(s);
+    l[*count].other = other, l[*count].block = blk;
+    ++*count;
     return TSS_OK;
 }
 
-// q (modes) = Jᵀ x: rows in order, in TSS__SUB_LANES sums.
+static int tss__sub_nonzero(const double *blk, int dd) {
+    double size = 0;
+    for (int q = 0; q < dd; q++) size += fabs(blk[q]);
+    return size > 0;
+}
+
+// Blocks of row `row` towards enriched nodes (border 0: index among them) or towards border nodes.
+static tss_result tss__sub_link_row(tss_subspace *s, const tss_unknowns *u, int row, int border, int *count, tss__sub_buf *list) {
+    const int dd = s->dim * s->dim;
+    tss_result r = TSS_OK;
+    for (int part = 0; part < 2; part++) {
+        const tss_bcsr *K = part ? &s->C : &s->A;
+        if (!part && !tss__sub_u(&s->live_row)[row]) continue;
+        for (int64_t k = K->row[row]; k < K->row[row + 1] && r == TSS_OK; k++) {
+            int other = border ? tss__sub_i(&s->border_index)[u->node[K->col[k]]] : tss__sub_i(&s->xrow)[K->col[k]];
+            if (other < 0 || !tss__sub_nonzero(K->val + k * dd, dd)) continue;
+            r = tss__sub_link(s, count, list, other, K->val + k * dd);
+        }
+    }
+    return r;
+}
+
+static tss_result tss__sub_build_J(tss_subspace *s, const tss_unknowns *u) {
+    size_t n = (size_t)s->n;
+    int *index = (int *)tss__sub_need(s, &s->border_index, n, sizeof(int)), links = 0;
+    int *node = (int *)tss__sub_need(s, &s->border, n, sizeof(int));
+    int *bptr = (int *)tss__sub_need(s, &s->border_ptr, n + 1, sizeof(int));
+    int *xptr = (int *)tss__sub_need(s, &s->x_ptr, (size_t)s->xrows + 1, sizeof(int));
+    if (!index || !node || !bptr || !xptr) return tss__sub_no_memory(s);
+    for (int i = 0; i < s->n; i++) index[i] = -1;
+    s->borders = bptr[0] = xptr[0] = 0;
+    tss_result r = TSS_OK;
+    for (int k = 0; k < s->modal_count; k++) {
+        const tss__modal *m = tss__sub_modal(s, k);
+        for (int i = 0; m->a > 0 && i < m->lives && r == TSS_OK; i++) {
+            int at = tss__sub_i(&m->live)[i], before = links;
+            if (tss__sub_u(&s->on)[at]) continue;
+            r = tss__sub_link_row(s, u, u->row[at], 0, &links, &s->border_link);
+            if (links == before) continue;
+            index[at] = s->borders, node[s->borders++] = at;
+            bptr[s->borders] = links;
+        }
+    }
+    links = 0;
+    for (int i = 0; i < s->xrows && r == TSS_OK; i++) {
+        r = tss__sub_link_row(s, u, u->row[tss__sub_i(&s->xnode)[i]], 1, &links, &s->x_link);
+        xptr[i + 1] = links;
+    }
+    if (r == TSS_OK && !tss__sub_need(s, &s->border_u, (size_t)s->borders * (size_t)s->dim, sizeof(double)))
+        return tss__sub_no_memory(s);
+    return r;
+}
+
+// y += K x over the links of one node.
+static void tss__sub_follow(const tss_subspace *s, const tss__sub_buf *ptr, const tss__sub_buf *list, int i, double sign,
+                            const double *x, double *y) {
+    const tss__sub_jlink *l = (const tss__sub_jlink *)list->p;
+    const int d = s->dim;
+    for (int k = tss__sub_i(ptr)[i]; k < tss__sub_i(ptr)[i + 1]; k++)
+        for (int p = 0; p < d; p++)
+            for (int q = 0; q < d; q++) y[p] += sign * l[k].block[p * d + q] * x[l[k].other * d + q];
+}
+
 typedef struct tss__sub_jmul {
     tss_subspace *s;
     const double *in;
@@ -4399,22 +4432,29 @@ typedef struct tss__sub_jmul {
 static void tss__sub_Jt_task(int lane, int worker, void *arg) {
     const tss__sub_jmul *m = (const tss__sub_jmul *)arg;
     const tss_subspace *s = m->s;
+    const int d = s->dim;
     double *q = m->out + (size_t)lane * s->modes;
     (void)worker;
     memset(q, 0, s->modes * sizeof(double));
-    int from = (int)((int64_t)s->jrows * lane / TSS__SUB_LANES), to = (int)((int64_t)s->jrows * (lane + 1) / TSS__SUB_LANES);
-    for (int k = from; k < to; k++) {
-        const tss__sub_jrow *j = (const tss__sub_jrow *)s->jrow.p + k;
-        const tss__modal *b = tss__sub_modal(s, j->body);
-        for (int p = 0; p < s->dim; p++)
-            tss__sub_axpy(b->a, m->in[j->x * s->dim + p], tss__sub_f(&s->jval) + j->at + (size_t)(p * b->a), q + b->at);
+    int from = (int)((int64_t)s->borders * lane / TSS__SUB_LANES), to = (int)((int64_t)s->borders * (lane + 1) / TSS__SUB_LANES);
+    for (int i = from; i < to; i++) {
+        int node = tss__sub_i(&s->border)[i];
+        const tss__modal *b = tss__sub_modal(s, tss__sub_i(&s->body_of)[node]);
+        size_t at = (size_t)tss__sub_i(&s->live_index)[node];
+        double v[3] = {0, 0, 0};
+        tss__sub_follow(s, &s->border_ptr, &s->border_link, i, 1, m->in, v);
+        for (int p = 0; p < d; p++) {
+            tss__sub_axpy(b->c, v[p], tss__sub_f(&b->phi) + at * (size_t)b->c, q + b->at + p * b->c);
+            tss__sub_axpy(b->r, v[p], tss__sub_f(&b->vec) + (at * (size_t)d + (size_t)p) * (size_t)b->r, q + b->at + d * b->c);
+        }
     }
 }
 
+// q (modes) = Jᵀ x: border nodes in order, in TSS__SUB_LANES sums.
 static tss_result tss__sub_Jt(tss_subspace *s, const double *x, double *q) {
     tss__sub_jmul m = {s, x, (double *)tss__sub_need(s, &s->lane, TSS__SUB_LANES * s->modes, sizeof(double))};
     if (!m.out) return tss__sub_no_memory(s);
-    if (s->jrows < 64)
+    if (s->borders < 64)
         for (int l = 0; l < TSS__SUB_LANES; l++) tss__sub_Jt_task(l, 0, &m);
     else
         tss_parallel(&s->host, TSS__SUB_LANES, tss__sub_Jt_task, &m);
@@ -4423,35 +4463,51 @@ static tss_result tss__sub_Jt(tss_subspace *s, const double *x, double *q) {
     return TSS_OK;
 }
 
-// x −= J q, enriched rows one by one (a row may couple to several bodies: rows of one node adjoin).
-static void tss__sub_J_task(int lane, int worker, void *arg) {
+static double tss__sub_dot(int n, const double *a, const double *b) {
+    double sum[4] = {0, 0, 0, 0};
+    int i = 0;
+    for (; i + 4 <= n; i += 4)
+        for (int t = 0; t < 4; t++) sum[t] += a[i + t] * b[i + t];
+    for (; i < n; i++) sum[0] += a[i] * b[i];
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+// Displacement of border nodes by modes q.
+static void tss__sub_border_task(int chunk, int worker, void *arg) {
     const tss__sub_jmul *m = (const tss__sub_jmul *)arg;
     const tss_subspace *s = m->s;
-    const tss__sub_jrow *row = (const tss__sub_jrow *)s->jrow.p;
+    const int d = s->dim;
     (void)worker;
-    int from = (int)((int64_t)s->jrows * lane / TSS__SUB_LANES), to = (int)((int64_t)s->jrows * (lane + 1) / TSS__SUB_LANES);
-    while (from > 0 && from < s->jrows && row[from].x == row[from - 1].x) from++;  // the lane before has it
-    while (to > 0 && to < s->jrows && row[to].x == row[to - 1].x) to++;
-    for (int k = from; k < to; k++) {
-        const tss__modal *b = tss__sub_modal(s, row[k].body);
-        for (int p = 0; p < s->dim; p++) {
-            const double *J = tss__sub_f(&s->jval) + row[k].at + (size_t)(p * b->a), *q = m->in + b->at;
-            double sum[4] = {0, 0, 0, 0};
-            int i = 0;
-            for (; i + 4 <= b->a; i += 4)
-                for (int t = 0; t < 4; t++) sum[t] += J[i + t] * q[i + t];
-            for (; i < b->a; i++) sum[0] += J[i] * q[i];
-            m->out[row[k].x * s->dim + p] -= (sum[0] + sum[1]) + (sum[2] + sum[3]);
-        }
+    int to = (chunk + 1) * TSS__SUB_CHUNK < s->borders ? (chunk + 1) * TSS__SUB_CHUNK : s->borders;
+    for (int i = chunk * TSS__SUB_CHUNK; i < to; i++) {
+        int node = tss__sub_i(&s->border)[i];
+        const tss__modal *b = tss__sub_modal(s, tss__sub_i(&s->body_of)[node]);
+        size_t at = (size_t)tss__sub_i(&s->live_index)[node];
+        for (int p = 0; p < d; p++)
+            tss__sub_f(&s->border_u)[i * d + p] =
+                tss__sub_dot(b->c, tss__sub_f(&b->phi) + at * (size_t)b->c, m->in + b->at + p * b->c) +
+                tss__sub_dot(b->r, tss__sub_f(&b->vec) + (at * (size_t)d + (size_t)p) * (size_t)b->r, m->in + b->at + d * b->c);
     }
 }
 
+static void tss__sub_J_task(int chunk, int worker, void *arg) {
+    const tss__sub_jmul *m = (const tss__sub_jmul *)arg;
+    const tss_subspace *s = m->s;
+    (void)worker;
+    int to = (chunk + 1) * 512 < s->xrows ? (chunk + 1) * 512 : s->xrows;
+    for (int i = chunk * 512; i < to; i++)
+        tss__sub_follow(s, &s->x_ptr, &s->x_link, i, -1, tss__sub_f(&s->border_u), m->out + i * s->dim);
+}
+
+// x −= J q
 static void tss__sub_minus_J(tss_subspace *s, const double *q, double *x) {
     tss__sub_jmul m = {s, q, x};
-    if (s->jrows < 64)
-        for (int l = 0; l < TSS__SUB_LANES; l++) tss__sub_J_task(l, 0, &m);
+    int chunks = (s->borders + TSS__SUB_CHUNK - 1) / TSS__SUB_CHUNK;
+    if (chunks < 4)
+        for (int k = 0; k < chunks; k++) tss__sub_border_task(k, 0, &m);
     else
-        tss_parallel(&s->host, TSS__SUB_LANES, tss__sub_J_task, &m);
+        tss_parallel(&s->host, chunks, tss__sub_border_task, &m);
+    tss_parallel(&s->host, (s->xrows + 511) / 512, tss__sub_J_task, &m);
 }
 
 // y = (H_x − J H_q⁻¹ Jᵀ) x
@@ -4459,7 +4515,7 @@ static void tss__sub_schur_apply(void *user, const double *x, double *y) {
     tss_subspace *s = (tss_subspace *)user;
     tss_bcsr_multiply(&s->host, &s->Ax, x, y, 0);
     tss_bcsr_multiply(&s->host, &s->Cx, x, y, 1);
-    if (s->jrows == 0) return;
+    if (s->borders == 0) return;
     double *q = tss__sub_f(&s->modal_work);
     tss_result r = tss__sub_Jt(s, x, q);
     if (r == TSS_OK) r = tss__sub_modal_apply(s, 1, q, q);
@@ -4487,7 +4543,10 @@ static tss_result tss__sub_pcg(tss_subspace *s, const double *b, double *x, int 
 // Work of one PCG iteration, in dense flops.
 static double tss__sub_pcg_work(const tss_subspace *s) {
     double jwork = 0, blocks = (double)(s->Ax.row[s->xrows] + s->Cx.row[s->xrows]);
-    for (int k = 0; k < s->jrows; k++) jwork += 4.0 * s->dim * tss__sub_modal(s, ((tss__sub_jrow *)s->jrow.p)[k].body)->a;
+    for (int k = 0; k < s->borders; k++)
+        jwork += 4.0 * tss__sub_modal(s, tss__sub_i(&s->body_of)[tss__sub_i(&s->border)[k]])->a;
+    jwork += 4.0 * s->dim * s->dim * (s->xrows > 0 ? tss__sub_i(&s->x_ptr)[s->xrows] : 0);
+    for (int k = 0; k < s->modal_count; k++) jwork += 2.0 * tss__sub_modal(s, k)->thin_rank * tss__sub_modal(s, k)->thin_rank;
     return TSS__SUB_PCG_FLOP * (2.0 * blocks * s->dim * s->dim + jwork + 20.0 * s->xrows * s->dim);
 }
 
@@ -4510,7 +4569,7 @@ static tss_result tss__sub_analyze_x(tss_subspace *s, double *direct) {
     if (r != TSS_OK) return tss_world_fail(s->w, r, "subspace: H_x: %s", tss_result_text(r));
     tss_chol_get_info(s->chol_x, &info);
     for (int k = 0; k < s->modal_count; k++) width += tss__sub_modal(s, k)->thin_rank;
-    if (s->jrows == 0) width = 0;
+    if (s->borders == 0) width = 0;
     *direct = info.flops + 16.0 * (double)info.nonzeros * (1 + width) + 4.0 * s->xrows * s->dim * width * width +
               width * width * width;
     return TSS_OK;
@@ -4536,16 +4595,26 @@ static tss_result tss__sub_factor_x(tss_subspace *s) {
 static void tss__sub_J_columns(tss_subspace *s, int width, double *X) {
     size_t nx = (size_t)(s->xrows * s->dim);
     memset(X, 0, nx * (size_t)width * sizeof(double));
-    for (int k = 0; k < s->jrows; k++) {
-        const tss__sub_jrow *j = (const tss__sub_jrow *)s->jrow.p + k;
-        const tss__modal *b = tss__sub_modal(s, j->body);
-        for (int p = 0; p < s->dim; p++) {
-            size_t row = (size_t)(j->x * s->dim + p);
-            if (s->masked && tss__sub_u(&s->xmask)[row]) continue;
-            const double *J = tss__sub_f(&s->jval) + j->at + (size_t)(p * b->a);
-            for (int c = 0; c < b->thin_rank; c++) X[(size_t)(b->offset + c) * nx + row] = J[tss__sub_kept(b, 1)[c]];
+    const tss__sub_jlink *l = (const tss__sub_jlink *)s->x_link.p;
+    const int d = s->dim;
+    for (int i = 0; i < s->xrows; i++)
+        for (int k = tss__sub_i(&s->x_ptr)[i]; k < tss__sub_i(&s->x_ptr)[i + 1]; k++) {
+            int node = tss__sub_i(&s->border)[l[k].other];
+            const tss__modal *b = tss__sub_modal(s, tss__sub_i(&s->body_of)[node]);
+            size_t at = (size_t)tss__sub_i(&s->live_index)[node];
+            const double *phi = tss__sub_f(&b->phi) + at * (size_t)b->c, *vec = tss__sub_f(&b->vec) + at * (size_t)(d * b->r);
+            for (int c = 0; c < b->thin_rank; c++) {
+                int mode = tss__sub_kept(b, 1)[c];
+                for (int p = 0; p < d; p++) {
+                    double sum = 0;
+                    if (mode < d * b->c) sum = l[k].block[p * d + mode / b->c] * phi[mode % b->c];
+                    for (int q = 0; mode >= d * b->c && q < d; q++) sum += l[k].block[p * d + q] * vec[q * b->r + mode - d * b->c];
+                    X[(size_t)(b->offset + c) * nx + (size_t)(i * d + p)] += sum;
+                }
+            }
         }
-    }
+    for (size_t k = 0; s->masked && k < nx; k++)
+        for (int c = 0; c < width && tss__sub_u(&s->xmask)[k]; c++) X[(size_t)c * nx + k] = 0;
 }
 
 // Dense H_q of all bodies at once, chosen modes, lower triangle.
@@ -5493,7 +5562,8 @@ static void tss__sub_destroy(void *user, const tss_host *host) {
         &s->part_node, &s->part_row, &s->part_col, &s->stencil_ptr, &s->stencil_id, &s->stencil_local,
         &s->stencil_slot, &s->stencil_at, &s->part_of, &s->part_of_at, &s->secant, &s->secant_g, &s->part_diag,
         &s->near_ptr, &s->near_id, &s->want, &s->live_row, &s->live_index, &s->row_list, &s->d_a, &s->x_a, &s->rhs,
-        &s->H, &s->cross, &s->cross_val, &s->lane, &s->xrow, &s->xnode, &s->jrow, &s->jval, &s->small,
+        &s->H, &s->cross, &s->cross_val, &s->lane, &s->xrow, &s->xnode, &s->border, &s->border_index,
+        &s->border_ptr, &s->border_link, &s->border_u, &s->x_ptr, &s->x_link, &s->small,
         &s->small_work, &s->small_rhs, &s->factors, &s->modal_work, &s->columns, &s->pair_key, &s->solution,
         &s->scratch, &s->xmask, &s->dq, &s->dyn_ptr, &s->dyn_id, &s->pending, &s->activate, &s->held};
     for (size_t k = 0; k < sizeof all / sizeof *all; k++) tss__sub_drop(s, all[k]);
