@@ -178,6 +178,8 @@ typedef struct tss_ctx {
     // ∇E at x_t of all energies that are not DYNAMIC, n × d, αh² and inertia included; only during
     // begin_step, and only if some energy has WANTS_GRADIENT (else NULL).
     const double *g;
+    // Only during check: look at these nodes (n, 1: set free since the last check); NULL: at all.
+    const uint8_t *fresh;
 } tss_ctx;
 
 // Which stencils a batch call is about: list[0..count-1], or first..first+count-1 if list is NULL.
@@ -240,7 +242,8 @@ typedef struct tss_energy_def {
     // What must survive a checkpoint. save == 0: reads. Returns the bytes the state takes, or 0 on
     // a mismatch; with data NULL only the size.
     size_t (*state)(void *user, void *data, size_t size, int save);
-    // The doctor asks: report what is wrong at x (intersections by name), and the values chosen.
+    // The doctor asks, and a step that starts from a state no step has passed: report what is wrong
+    // at x (intersections by name), and the values chosen.
     void (*check)(void *user, const tss_ctx *c, const double *x, tss_issue_fn *add, void *arg);
     // Smallest distance to the edge of the feasible set at x, m (contact: between surfaces; +inf
     // when nothing is near). Called at the end of a step.
@@ -663,7 +666,9 @@ TSS_API const int *tss_body_cells(const tss_world *w, tss_body b);
 // All may be called before and after prepare, between steps. Node numbers are the world's.
 // ---------------------------------------------------------------------------------------------
 
-// Fixes the axes (bit c = coordinate c; 7 = all) of a node where they are; axes 0 sets it free.
+// Fixes the axes (bit c = coordinate c; 7 = all) of a node where they are; axes 0 sets it free. The
+// next step refuses to start (INTERSECTION) if what is set free intersects. Errors: BAD_ARGUMENT for
+// nodes of obstacles and of removed bodies.
 TSS_API tss_result tss_node_pin(tss_world *w, int node, unsigned axes);
 // Scripts a node: it moves to target (dim) within the next step and stays until told otherwise.
 TSS_API tss_result tss_node_target(tss_world *w, int node, const double *target);
@@ -758,7 +763,8 @@ TSS_API tss_result tss_world_energy(tss_world *w, double *kinetic, double *poten
 TSS_API uint64_t tss_world_hash(const tss_world *w);
 
 // Checkpoints: bit-exact resume into a world built by the same calls. save returns the bytes
-// needed (data NULL: only that) or 0 on too small a size; load refuses anything that does not fit.
+// needed (data NULL: only that) or 0 on too small a size; load refuses anything that does not fit
+// or is not finite, and then changes nothing (FORMAT, MISMATCH, NO_MEMORY).
 TSS_API size_t tss_world_save(const tss_world *w, void *data, size_t size);
 TSS_API tss_result tss_world_load(tss_world *w, const void *data, size_t size);
 
@@ -5592,6 +5598,9 @@ struct tss_chol {
     int orderings, analyses, bad_row;
     tss_chol_reuse reuse;
     tss__buf order, work, L, arena, task_arena, map, diag, rhs, part, bad, refine;
+    tss__buf kept;  // the ordering at the last mark
+    int kept_n, kept_d, kept_orderings;
+    double kept_flops;
 };
 
 tss_chol_def tss_chol_def_default(void) {
@@ -5622,7 +5631,7 @@ tss_result tss_chol_create(const tss_host *host, const tss_chol_def *def, tss_ch
 // All buffers of a factorisation, for freeing and counting.
 static int tss__chol_buffers(tss_chol *c, tss__buf **list) {
     tss__buf *own[] = {&c->order, &c->work, &c->L,    &c->arena, &c->task_arena, &c->map,
-                       &c->diag,  &c->rhs,  &c->part, &c->bad,   &c->refine};
+                       &c->diag,  &c->rhs,  &c->part, &c->bad,   &c->refine, &c->kept};
     int k = 0;
     for (size_t i = 0; i < sizeof own / sizeof own[0]; i++) list[k++] = own[i];
     for (int s = 0; s < 2; s++)
@@ -5630,7 +5639,7 @@ static int tss__chol_buffers(tss_chol *c, tss__buf **list) {
     return k;
 }
 
-enum { TSS__CHOL_BUFFERS = 11 + 2 * TSS__S_COUNT };
+enum { TSS__CHOL_BUFFERS = 12 + 2 * TSS__S_COUNT };
 
 void tss_chol_destroy(tss_chol *c) {
     if (!c) return;
@@ -5891,8 +5900,27 @@ tss_result tss_chol_set_order(tss_chol *c, int n, int d, const int *order, doubl
     int *to = tss__need_ints(&c->host, &c->order, (size_t)n);
     if (!to) return TSS_ERROR_NO_MEMORY;
     if (n > 0) memcpy(to, order, (size_t)n * sizeof(int));
-    c->order_n = n, c->order_d = d, c->flops_ordered = flops;
+    c->order_n = n, c->order_d = d, c->flops_ordered = flops, c->orderings++;
     return TSS_OK;
+}
+
+// Keeps the ordering, so that tss__chol_rewind can take it back without memory.
+static tss_result tss__chol_mark(tss_chol *c) {
+    int *to = tss__need_ints(&c->host, &c->kept, (size_t)c->order_n);
+    if (!to) return TSS_ERROR_NO_MEMORY;
+    if (c->order_n > 0) memcpy(to, c->order.p, (size_t)c->order_n * sizeof(int));
+    c->kept_n = c->order_n, c->kept_d = c->order_d, c->kept_orderings = c->orderings;
+    c->kept_flops = c->flops_ordered;
+    return TSS_OK;
+}
+
+static void tss__chol_rewind(tss_chol *c) {
+    if (c->orderings == c->kept_orderings && c->order_n == c->kept_n) return;
+    tss__buf spare = c->order;
+    c->order = c->kept, c->kept = spare;
+    c->order_n = c->kept_n, c->order_d = c->kept_d, c->flops_ordered = c->kept_flops;
+    c->kept_orderings = c->orderings;
+    c->analyzed = c->factored = 0;
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -6819,12 +6847,14 @@ struct tss_world {
     tss_world_def def;
     tss_host host;  // counts what it hands out
     size_t bytes;
-    uint64_t allocations;
+    uint64_t allocations, refused;  // calls of the allocator: served, and not
     char error[256];
     int prepared, dim, n;
     double time, diagonal;
     uint64_t steps, topology;
     int history;  // 0: the next step starts the integrator anew
+    int unchecked;  // no step has passed this state: 1: at the fresh nodes, 2: anywhere
+    tss__buf fresh;  // n: 1: set free since the last check
 
     // state and node data, n × dim or n
     tss__buf x, v, x_prev, v_prev, a;             // state at t, and what BDF2 and Newmark remember
@@ -6859,6 +6889,7 @@ struct tss_world {
     tss_pcg *pcg;
     double pcg_iterations;  // what recent PCG solves needed (0: none yet)
     int pcg_rest;           // solves to go before PCG is tried again
+    tss__buf kept;          // what energies remember, as it was before the step
     tss_step_info info;
     double deadline;
     double phase_from;
@@ -6910,6 +6941,8 @@ static void *tss__count_alloc(size_t bytes, size_t align, void *ctx) {
     if (p) {
         w->bytes += bytes;
         w->allocations++;
+    } else {
+        w->refused++;
     }
     return p;
 }
@@ -7539,6 +7572,21 @@ static tss_result tss__check_referenced(tss_world *w, const char *body, const ts
     return TSS_OK;
 }
 
+// What prepare would find out too late: the body is in the world by then.
+static tss_result tss__check_kind(tss_world *w, const char *name, const tss_body_def *d) {
+    const tss_material *m = &d->material;
+    if ((unsigned)m->kind >= TSS_MATERIAL_KINDS)
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: no material of kind %d", name, (int)m->kind);
+    if (m->kind == TSS_CUSTOM_MATERIAL && !m->density)
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: a custom material needs a density", name);
+    if (m->kind == TSS_CUSTOM_MATERIAL && m->damping > 0)
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: a custom material cannot be damped", name);
+    if (d->cells == 0 && (!(d->thickness > 0) || !isfinite(d->thickness)))
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: thickness = %g m, expected a positive number",
+                              name, d->thickness);
+    return TSS_OK;
+}
+
 static tss_result tss__check_body(tss_world *w, const char *name, const tss_body_def *d) {
     tss_result r;
     if (d->cookie != TSS__COOKIE)
@@ -7554,6 +7602,7 @@ static tss_result tss__check_body(tss_world *w, const char *name, const tss_body
     if ((r = tss__check_finite(w, name, "rest position", d->X, d->nodes)) != TSS_OK) return r;
     if ((r = tss__check_finite(w, name, "position", d->x0, d->nodes)) != TSS_OK) return r;
     if ((r = tss__check_finite(w, name, "velocity", d->v0, d->nodes)) != TSS_OK) return r;
+    if (!d->v0 && (r = tss__check_finite(w, name, "velocity", d->velocity, 1)) != TSS_OK) return r;
     if ((r = tss__check_nodes(w, name, "cell", d->cells, w->dim + 1, d->cell, d->nodes)) != TSS_OK)
         return r;
     if ((r = tss__check_nodes(w, name, "triangle", d->triangles, 3, d->triangle, d->nodes)) != TSS_OK)
@@ -7564,6 +7613,7 @@ static tss_result tss__check_body(tss_world *w, const char *name, const tss_body
     if ((r = tss__check_nodes(w, name, "pin", d->pins, 1, d->pin, d->nodes)) != TSS_OK) return r;
     if (w->dim == 2 && d->triangles > 0)
         return tss_world_fail(w, TSS_ERROR_BAD_MESH, "%s: in 2D, triangles are cells and surfaces segments", name);
+    if (d->kind == TSS_BODY_SOFT && (r = tss__check_kind(w, name, d)) != TSS_OK) return r;
     double damping = d->material.damping;
     if (!(damping >= 0) || !isfinite(damping))
         return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: damping = %g s, expected >= 0", name, damping);
@@ -7765,7 +7815,8 @@ static tss_result tss__nodes_reserve(tss_world *w, size_t n) {
     for (size_t k = 0; k < sizeof wide / sizeof *wide; k++)
         if (!tss__need(&w->host, wide[k], nd, sizeof(double))) return tss__no_memory(w);
     if (!tss__need(&w->host, &w->mass, n, sizeof(double)) || !tss__need(&w->host, &w->kind, n, 1) ||
-        !tss__need(&w->host, &w->axes, n, 1) || !tss__need(&w->host, &w->body, n, sizeof(int)))
+        !tss__need(&w->host, &w->axes, n, 1) || !tss__need(&w->host, &w->fresh, n, 1) ||
+        !tss__need(&w->host, &w->body, n, sizeof(int)))
         return tss__no_memory(w);
     return TSS_OK;
 }
@@ -7785,7 +7836,7 @@ static void tss__nodes_append(tss_world *w, const tss_body_def *d, int id) {
     tss__masses(w, d, tss__f64(&w->mass) + first);
     for (int i = 0; i < d->nodes; i++) {
         tss__i32(&w->body)[first + i] = id;
-        tss__u8(&w->axes)[first + i] = 0;
+        tss__u8(&w->axes)[first + i] = tss__u8(&w->fresh)[first + i] = 0;
         tss__u8(&w->kind)[first + i] = d->kind == TSS_BODY_OBSTACLE ? TSS_NODE_OBSTACLE : TSS_NODE_FREE;
     }
     for (int k = 0; k < d->pins; k++) {
@@ -7825,7 +7876,7 @@ tss_result tss_body_add(tss_world *w, const tss_body_def *d, tss_body *out) {
     *TSS__BODY(w, w->body_count) = b;
     if (out) *out = w->body_count;
     w->body_count++;
-    w->prepared = 0, w->history = 0;
+    w->prepared = 0, w->history = 0, w->unchecked = 2;
     return TSS_OK;
 }
 
@@ -7885,9 +7936,15 @@ static tss_result tss__finite(tss_world *w, const char *what, const double *a, i
     return TSS_OK;
 }
 
+// A kinematic node may lie where no free one could be: setting it free asks for a check of the start,
+// at the nodes concerned only, so that pins that come and go do not pay for the whole scene.
 static void tss__set_kind(tss_world *w, int node, uint8_t kind, uint8_t axes) {
     uint8_t *k = tss__u8(&w->kind) + node, *a = tss__u8(&w->axes) + node;
     if (*k == kind && *a == axes) return;
+    if (*k != TSS_NODE_FREE && kind == TSS_NODE_FREE) {
+        tss__u8(&w->fresh)[node] = 1;
+        w->unchecked = w->unchecked ? w->unchecked : 1;
+    }
     *k = kind, *a = axes;
     w->prepared = 0;
 }
@@ -7896,14 +7953,19 @@ tss_result tss_node_pin(tss_world *w, int node, unsigned axes) {
     tss_result r = tss__has_node(w, node);
     if (r != TSS_OK) return r;
     unsigned all = w->dim == 3 ? 7u : 3u;
-    if (TSS__BODY(w, tss__i32(&w->body)[node])->kind == TSS_BODY_OBSTACLE)
-        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d belongs to an obstacle", node);
+    const tss__bodydata *b = TSS__BODY(w, tss__i32(&w->body)[node]);
+    if (b->kind == TSS_BODY_OBSTACLE || b->removed)
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d belongs to %s", node,
+                              b->removed ? "a removed body" : "an obstacle");
     axes &= all;
     tss__set_kind(w, node, axes == all ? TSS_NODE_PINNED : TSS_NODE_FREE,
                   (uint8_t)(axes == all ? 0 : axes));
-    for (int c = 0; c < w->dim; c++) {
-        if (axes >> c & 1) tss__f64(&w->v)[node * w->dim + c] = 0;
-        tss__f64(&w->target)[node * w->dim + c] = tss__f64(&w->x)[node * w->dim + c];
+    for (int k = node * w->dim, c = 0; c < w->dim; k++, c++) {
+        tss__f64(&w->target)[k] = tss__f64(&w->x)[k];
+        if (!(axes >> c & 1)) continue;
+        // at rest, also for the integrator: the speed it had must not come back
+        tss__f64(&w->x_prev)[k] = tss__f64(&w->x)[k];
+        tss__f64(&w->v)[k] = tss__f64(&w->v_prev)[k] = tss__f64(&w->a)[k] = 0;
     }
     return TSS_OK;
 }
@@ -7912,6 +7974,8 @@ tss_result tss_node_target(tss_world *w, int node, const double *target) {
     tss_result r = tss__has_node(w, node);
     if (r == TSS_OK && !target) r = tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d: target is NULL", node);
     if (r == TSS_OK) r = tss__finite(w, "target", target, w->dim);
+    if (r == TSS_OK && TSS__BODY(w, tss__i32(&w->body)[node])->removed)
+        r = tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "node %d belongs to a removed body", node);
     if (r != TSS_OK) return r;
     if (tss__u8(&w->kind)[node] != TSS_NODE_OBSTACLE) tss__set_kind(w, node, TSS_NODE_SCRIPTED, 0);
     memcpy(tss__f64(&w->target) + node * w->dim, target, (size_t)w->dim * sizeof(double));
@@ -7986,7 +8050,7 @@ tss_result tss_body_teleport(tss_world *w, tss_body id, const double *x, const d
     memcpy(tss__f64(&w->x) + at, x, len * sizeof(double));
     memcpy(tss__f64(&w->target) + at, x, len * sizeof(double));
     for (size_t k = 0; k < len; k++) tss__f64(&w->v)[at + k] = v ? v[k] : 0;
-    w->history = 0;
+    w->history = 0, w->unchecked = 2;
     return TSS_OK;
 }
 
@@ -8144,7 +8208,7 @@ tss_result tss_energy_add(tss_world *w, const tss_energy_def *d, tss_energy *out
         return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT,
                          "%s: lists, value, gradient and hessian are required", name);
     int id = w->entry_count;
-    for (int k = 0; k < w->entry_count; k++)  // places of replaced internal energies are used again
+    for (int k = w->entry_count - 1; k >= 0; k--)  // the first place of a replaced internal energy
         if (!TSS__ENTRY(w, k)->live && TSS__ENTRY(w, k)->internal) id = k;
     if (!tss__need(&w->host, &w->entries, (size_t)id + 1, sizeof(tss__entry))) return tss__no_memory(w);
     tss__entry *e = TSS__ENTRY(w, id);
@@ -8157,6 +8221,7 @@ tss_result tss_energy_add(tss_world *w, const tss_energy_def *d, tss_energy *out
     memset(&e->list, 0, sizeof e->list);
     snprintf(e->name, sizeof e->name, "%s", name);
     e->def.name = NULL;  // e->name is the copy
+    if (d->check) w->unchecked = 2;
     w->prepared = 0, w->matrix_valid = 0;
     if (out) *out = id;
     return TSS_OK;
@@ -8355,6 +8420,7 @@ static tss_result tss__prepare_elastic(tss_world *w) {
     }
     tss__buf_free(&w->host, &keys), tss__buf_free(&w->host, &space);
     if (r == TSS_OK) w->elastic_bodies = w->body_count, w->elastic_alive = alive;
+    if (r != TSS_OK) tss__elastic_clear(w);
     return r;
 }
 
@@ -8563,7 +8629,7 @@ void tss_world_destroy(tss_world *w) {
                        &w->surf_triangle, &w->elastics, &w->inertia_node, &w->x_k,
                        &w->x_t, &w->v_t, &w->x_tilde, &w->x_trial, &w->d, &w->g, &w->g_trial, &w->rhs,
                        &w->moving, &w->row, &w->mask, &w->colormask, &w->node_of_row, &w->scratch,
-                       &w->sys_d, &w->diag, &w->pair_count, &w->pair_col};
+                       &w->sys_d, &w->diag, &w->pair_count, &w->pair_col, &w->fresh, &w->kept};
     for (size_t k = 0; k < sizeof all / sizeof *all; k++) tss__buf_free(h, all[k]);
     tss__matrix_free(h, &w->A), tss__matrix_free(h, &w->C);
     tss__linear_free(w);
@@ -8886,6 +8952,10 @@ static tss_result tss__direction(tss_world *w, tss__iter *it, tss_status *failed
         for (int c = 0; c < w->dim; c++)
             it->dnorm = tss__max(it->dnorm, fabs(d[tss__i32(&w->node_of_row)[k] * w->dim + c]));
     it->gd = tss__dot_blocks(g, d, w->n * w->dim);
+    // A NaN passes every comparison that could find it later, convergence first.
+    if (!isfinite(it->gd) || !isfinite(it->dnorm) || !isfinite(it->E))
+        tss__stop(w, *failed = TSS_STEP_LINEAR,
+                  "energy %g, slope %g: a force or a stiffness is not finite", it->E, it->gd);
     return TSS_OK;
 }
 
@@ -8974,6 +9044,60 @@ static tss_result tss__line_search(tss_world *w, tss__iter *it, int *found) {
 }
 
 // ---------------------------------------------------------------------------------------------
+// >>parts (private)
+// What energies and the direction finder remember between steps, one part after the other: its
+// length, its bytes. For checkpoints, and to take back what a step that failed has changed.
+// ---------------------------------------------------------------------------------------------
+
+// Part k: energy k, or after the last of them the direction finder.
+static size_t tss__part_state(const tss_world *w, int k, void *data, size_t size, int save) {
+    if (k == w->entry_count)
+        return w->finder.state ? w->finder.state(w->finder.user, data, size, save) : 0;
+    const tss__entry *e = TSS__ENTRY(w, k);
+    return e->live && e->def.state ? e->def.state(e->def.user, data, size, save) : 0;
+}
+
+// Removed energies have no part: where they lay depends on what was added and removed when.
+static int tss__is_part(const tss_world *w, int k) {
+    return k == w->entry_count || TSS__ENTRY(w, k)->live;
+}
+
+static int tss__part_has_state(const tss_world *w, int k) {
+    if (k == w->entry_count) return w->finder.state != NULL;
+    return TSS__ENTRY(w, k)->live && TSS__ENTRY(w, k)->def.state != NULL;
+}
+
+// Writes the first `parts` of them to data (NULL: nothing); returns the bytes.
+static size_t tss__save_parts(const tss_world *w, int parts, char *data) {
+    size_t all = 0;
+    for (int k = 0; k < parts; k++) {
+        if (!tss__is_part(w, k)) continue;
+        uint64_t len = tss__part_state(w, k, NULL, 0, 1);
+        if (data) memcpy(data + all, &len, sizeof len);
+        all += sizeof len;
+        if (data) tss__part_state(w, k, data + all, (size_t)len, 1);
+        all += (size_t)len;
+    }
+    return all;
+}
+
+// Walks them: restore 0 only measures. 0 where something does not fit.
+static int tss__load_parts(tss_world *w, int parts, const char *from, size_t left, int restore) {
+    for (int k = 0; k < parts; k++) {
+        uint64_t len;
+        if (!tss__is_part(w, k)) continue;
+        if (left < sizeof len) return 0;
+        memcpy(&len, from, sizeof len), from += sizeof len, left -= sizeof len;
+        if (len > left) return 0;
+        if (len > 0 && !tss__part_has_state(w, k)) return 0;
+        void *part = (void *)(uintptr_t)from;
+        if (restore && len > 0 && tss__part_state(w, k, part, (size_t)len, 0) != len) return 0;
+        from += len, left -= (size_t)len;
+    }
+    return left == 0;
+}
+
+// ---------------------------------------------------------------------------------------------
 // >>step (private)
 // Prediction, Newton iterates until ‖d‖∞/h ≤ ε, velocities (Eq. 1–3, footnote 9).
 // ---------------------------------------------------------------------------------------------
@@ -9049,10 +9173,13 @@ static void tss__advance(tss_world *w) {
             double a1 = 4 / (h * h) * (xn[k] - xt[k] - h * vt[k]) - a[k];
             vn = vt[k] + 0.5 * h * (a[k] + a1);
             a[k] = a1;
-        }
+        } else if (in == TSS_NEWMARK)
+            a[k] = 0;  // set free later, the node starts without a force of long ago
         xp[k] = xt[k], vp[k] = vt[k];
         x[k] = xn[k], v[k] = vn;
     }
+    w->unchecked = 0;
+    memset(w->fresh.p, 0, (size_t)w->n);
     w->history++;
     w->steps++;
     w->time += h;
@@ -9092,13 +9219,20 @@ static void tss__first_error(tss_severity severity, const char *text, void *arg)
 }
 
 // No step can start from an intersection or an inverted cell that a barrier forbids: say which.
+// Steps keep what they start from free of both, so only states that no step has passed are looked
+// at: a new start, a loaded one, one with a new energy to mind, nodes just set free.
 static tss_result tss__check_start(tss_world *w) {
     char first[240] = "";
+    uint64_t refused = w->refused;
+    if (!w->unchecked) return TSS_OK;
+    w->ctx.fresh = w->unchecked == 1 ? tss__u8(&w->fresh) : NULL;
     for (int k = 0; k < w->entry_count; k++) {
         tss__entry *e = TSS__ENTRY(w, k);
         if (e->live && e->def.check)
             e->def.check(e->def.user, &w->ctx, tss__f64(&w->x), tss__first_error, first);
     }
+    w->ctx.fresh = NULL;
+    if (w->refused != refused) return tss__no_memory(w);  // what was found is not all
     if (first[0]) return tss_world_fail(w, TSS_ERROR_INTERSECTION, "%s", first);
     for (int k = 0; k < w->elastic_count; k++) {
         const tss__elastic_ref *r = &((const tss__elastic_ref *)w->elastics.p)[k];
@@ -9118,12 +9252,9 @@ static tss_result tss__begin_step(tss_world *w) {
     memcpy(w->v_t.p, w->v.p, bytes);
     memcpy(w->x_k.p, w->x.p, bytes);
     tss__fill_ctx(w);
-    if (w->history == 0) {
-        tss_result bad = tss__check_start(w);
-        if (bad != TSS_OK) return bad;
-    }
+    tss_result r = tss__check_start(w);
+    if (r != TSS_OK) return r;
     if (w->chol) tss_chol_forget(w->chol);  // a resumed run takes the same path
-    tss_result r = TSS_OK;
     if (w->def.integrator == TSS_NEWMARK && w->history == 0) r = tss__start_newmark(w);
     if (r != TSS_OK) return r;
     tss__predict(w);
@@ -9243,7 +9374,11 @@ static double tss__node_residual(const double *D, const double *g, int dim) {
         for (int j = 0; j <= i; j++) {
             double s = D[i * dim + j];
             for (int k = 0; k < j; k++) s -= L[i * 3 + k] * L[j * 3 + k];
-            if (i == j && !(s > 0)) return 0;  // a node nothing holds has no residual to speak of
+            if (i == j && !(s > 0)) {  // nothing holds the node: is anything pulling?
+                double pull = 0;
+                for (int c = 0; c < dim; c++) pull += fabs(g[c]);
+                return pull == 0 ? 0 : INFINITY;
+            }
             L[i * 3 + j] = i == j ? sqrt(s) : s / L[j * 3 + j];
         }
     for (int i = 0; i < dim; i++) {
@@ -9327,6 +9462,27 @@ static tss_result tss__step_solves(tss_world *w) {
     return r;
 }
 
+// The step, from prediction to measurements, on x_k. If it fails, energies, the ordering of the
+// factorisation and the choice of solvers forget it too: the next one starts as it would have.
+static tss_result tss__attempt(tss_world *w, int full) {
+    size_t bytes = tss__save_parts(w, w->entry_count, NULL);
+    char *kept = (char *)tss__need(&w->host, &w->kept, bytes, 1);
+    if (!kept || (w->chol && tss__chol_mark(w->chol) != TSS_OK)) return tss__no_memory(w);
+    tss__save_parts(w, w->entry_count, kept);
+    double iterations = w->pcg_iterations, ah2 = w->ctx.ah2;
+    int rest = w->pcg_rest, had_chol = w->chol != NULL;
+    uint64_t refused = w->refused;
+    tss_result r = tss__step_solves(w);
+    if (r == TSS_OK) r = tss__finish(w, full);
+    if (r == TSS_OK && w->refused != refused) r = tss__no_memory(w);  // in a hook that returns none
+    if (r == TSS_OK) return r;
+    tss__load_parts(w, w->entry_count, kept, bytes, 1);
+    if (had_chol) tss__chol_rewind(w->chol);
+    else tss_chol_destroy(w->chol), w->chol = NULL;
+    w->pcg_iterations = iterations, w->pcg_rest = rest, w->ctx.ah2 = ah2;
+    return r;
+}
+
 static tss_result tss__take_step(tss_world *w, double budget, tss_step_info *info) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
     tss_result r = tss_world_prepare(w);
@@ -9337,9 +9493,8 @@ static tss_result tss__take_step(tss_world *w, double budget, tss_step_info *inf
     w->info.min_alpha = 1;
     w->phase_from = from;
     w->deadline = budget > 0 ? from + budget : 0;
-    r = tss__step_solves(w);
-    if (r == TSS_OK) r = tss__finish(w, info != NULL);
-    if (r != TSS_OK) return r;  // x and v are untouched: the step worked on x_k
+    r = tss__attempt(w, info != NULL);
+    if (r != TSS_OK) return r;  // x and v are untouched
     tss__advance(w);
     tss__phase(w, TSS_PHASE_OTHER);
     w->info.time = w->time;
@@ -9455,6 +9610,8 @@ static tss_result tss__probe_step(tss_world *w) {
     return r == TSS_OK ? tss__direction(w, &it, &failed) : r;
 }
 
+static tss_result tss__load_apply(tss_world *w, const char *data, size_t size);
+
 tss_result tss_world_probe(tss_world *w) {
     if (!w) return TSS_ERROR_BAD_ARGUMENT;
     tss_result r = tss_world_prepare(w);
@@ -9466,7 +9623,7 @@ tss_result tss_world_probe(tss_world *w) {
     tss_step_info info = w->info;
     memset(&w->info, 0, sizeof w->info);
     r = tss__probe_step(w);
-    tss_result back = tss_world_load(w, state, bytes);
+    tss_result back = tss__load_apply(w, (const char *)state, bytes);
     tss_free(&w->host, state, bytes);
     w->info = info;
     return r != TSS_OK ? r : back;
@@ -9536,6 +9693,7 @@ typedef struct tss__head {
     int64_t pcg_rest, order;  // order: nodes of the Cholesky ordering that follows the arrays
     double order_flops, tol;
     int64_t drags;  // node, stiffness, target of each
+    int64_t integrator;
 } tss__head;
 
 // The node arrays a checkpoint holds.
@@ -9564,17 +9722,10 @@ static size_t tss__copy_drags(const tss_world *w, char *at, int drags, int save)
     return all;
 }
 
-// Part k: energy k, or after the last of them the direction finder.
-static size_t tss__part_state(const tss_world *w, int k, void *data, size_t size, int save) {
-    if (k == w->entry_count)
-        return w->finder.state ? w->finder.state(w->finder.user, data, size, save) : 0;
-    const tss__entry *e = TSS__ENTRY(w, k);
-    return e->live && e->def.state ? e->def.state(e->def.user, data, size, save) : 0;
-}
-
-static int tss__part_has_state(const tss_world *w, int k) {
-    if (k == w->entry_count) return w->finder.state != NULL;
-    return TSS__ENTRY(w, k)->live && TSS__ENTRY(w, k)->def.state != NULL;
+static int tss__live_energies(const tss_world *w) {
+    int live = 0;
+    for (int k = 0; k < w->entry_count; k++) live += TSS__ENTRY(w, k)->live;
+    return live;
 }
 
 size_t tss_world_save(const tss_world *w, void *data, size_t size) {
@@ -9584,44 +9735,27 @@ size_t tss_world_save(const tss_world *w, void *data, size_t size) {
     for (int k = 0; k < count; k++) need += bytes[k];
     int order = w->chol ? tss_chol_get_order(w->chol, NULL, NULL) : 0;
     need += (size_t)order * sizeof(int) + (size_t)w->drags * tss__drag_bytes(w);
-    for (int k = 0; k <= w->entry_count; k++) need += sizeof(uint64_t) + tss__part_state(w, k, NULL, 0, 1);
+    need += tss__save_parts(w, w->entry_count + 1, NULL);
     if (!data) return need;
     if (size < need) return 0;
     tss__head h;
     memset(&h, 0, sizeof h);
-    h.magic = TSS__MAGIC, h.version = 2, h.dim = (uint64_t)w->dim, h.n = (uint64_t)w->n;
-    h.energies = (uint64_t)w->entry_count, h.steps = w->steps, h.history = w->history;
+    h.magic = TSS__MAGIC, h.version = 3, h.dim = (uint64_t)w->dim, h.n = (uint64_t)w->n;
+    h.energies = (uint64_t)tss__live_energies(w), h.steps = w->steps, h.history = w->history;
     h.time = w->time, h.ah2 = w->ctx.ah2, h.dt = w->def.dt;
     h.pcg_iterations = w->pcg_iterations, h.pcg_rest = w->pcg_rest;
     memcpy(h.gravity, w->def.gravity, sizeof h.gravity);
-    h.order = order, h.drags = w->drags, h.tol = w->def.tol;
+    h.order = order, h.drags = w->drags, h.tol = w->def.tol, h.integrator = w->def.integrator;
     if (w->chol) tss_chol_get_order(w->chol, NULL, &h.order_flops);
     char *to = (char *)data;
     memcpy(to, &h, sizeof h), to += sizeof h;
-    for (int k = 0; k < count; k++) memcpy(to, list[k]->p, bytes[k]), to += bytes[k];
+    for (int k = 0; k < count; k++, to += bytes[k - 1])
+        if (bytes[k] > 0) memcpy(to, list[k]->p, bytes[k]);
     if (order > 0) tss_chol_get_order(w->chol, (int *)(void *)to, NULL);
     to += (size_t)order * sizeof(int);
     to += tss__copy_drags(w, to, w->drags, 1);
-    for (int k = 0; k <= w->entry_count; k++) {
-        uint64_t len = tss__part_state(w, k, NULL, 0, 1);
-        memcpy(to, &len, sizeof len), to += sizeof len;
-        tss__part_state(w, k, to, (size_t)len, 1), to += len;
-    }
+    tss__save_parts(w, w->entry_count + 1, to);
     return need;
-}
-
-// Walks the parts of energies and finder: restore 0 only measures. 0 where something does not fit.
-static int tss__load_energies(tss_world *w, const char *from, size_t left, int restore) {
-    for (int k = 0; k <= w->entry_count; k++) {
-        uint64_t len;
-        if (left < sizeof len) return 0;
-        memcpy(&len, from, sizeof len), from += sizeof len, left -= sizeof len;
-        if (len > left) return 0;
-        if (len > 0 && !tss__part_has_state(w, k)) return 0;
-        if (restore && len > 0 && tss__part_state(w, k, (void *)(uintptr_t)from, (size_t)len, 0) != len) return 0;
-        from += len, left -= (size_t)len;
-    }
-    return left == 0;
 }
 
 // The ordering is what a Cholesky factorisation's bits depend on besides the matrix.
@@ -9637,52 +9771,190 @@ static tss_result tss__load_order(tss_world *w, const char *from, int n, double 
     return tss_chol_set_order(w->chol, n, w->dim, order, flops);
 }
 
+// Where the parts of a checkpoint lie.
+typedef struct tss__layout {
+    size_t arrays, order, drags, parts;
+} tss__layout;
+
+static tss__layout tss__layout_of(const tss_world *w, const tss__head *h) {
+    tss__layout l;
+    const tss__buf *list[9];
+    size_t bytes[9];
+    int count = tss__saved(w, list, bytes);
+    l.arrays = l.order = sizeof *h;
+    for (int k = 0; k < count; k++) l.order += bytes[k];
+    l.drags = l.order + (size_t)h->order * sizeof(int);
+    l.parts = l.drags + (size_t)h->drags * tss__drag_bytes(w);
+    return l;
+}
+
+// Does a checkpoint's head belong to this world?
+static tss_result tss__head_fits(tss_world *w, const tss__head *h) {
+    int live = tss__live_energies(w);
+    if (h->magic != TSS__MAGIC || h->version != 3)
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: not one of this version");
+    if (h->dim != (uint64_t)w->dim || h->n != (uint64_t)w->n || h->energies != (uint64_t)live)
+        return tss_world_fail(w, TSS_ERROR_MISMATCH,
+                              "checkpoint: %llu nodes in %llu dimensions, %llu energies; the scene "
+                              "has %d, %d, %d",
+                              (unsigned long long)h->n, (unsigned long long)h->dim,
+                              (unsigned long long)h->energies, w->n, w->dim, live);
+    if (h->integrator != (int64_t)w->def.integrator)
+        return tss_world_fail(w, TSS_ERROR_MISMATCH,
+                              "checkpoint: integrator %lld; the scene has %d",
+                              (long long)h->integrator, (int)w->def.integrator);
+    if (h->order < 0 || h->order > w->n)
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: an ordering of %lld nodes",
+                              (long long)h->order);
+    if (h->drags < 0 || h->drags > w->n)
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %lld dragged nodes",
+                              (long long)h->drags);
+    return TSS_OK;
+}
+
+// A number of the head that no world can have, or NULL.
+static const char *tss__head_fault(const tss_world *w, const tss__head *h) {
+    if (!(h->dt > 0) || !isfinite(h->dt)) return "dt";
+    if (!(h->ah2 > 0) || !isfinite(h->ah2)) return "the integrator's factor";
+    if (!isfinite(h->time)) return "time";
+    if (!isfinite(h->gravity[0] + h->gravity[1] + h->gravity[2])) return "gravity";
+    if (!(h->tol >= 0) || !(h->tol + w->def.tol_rel > 0)) return "tol";
+    if (h->history < 0 || h->history > INT32_MAX) return "history";
+    if (!(h->pcg_iterations >= 0) || !isfinite(h->pcg_iterations)) return "pcg_iterations";
+    if (h->pcg_rest < 0 || h->pcg_rest > TSS__PCG_REST) return "pcg_rest";
+    if (!(h->order_flops >= 0) || !isfinite(h->order_flops)) return "the ordering's flops";
+    return NULL;
+}
+
+static int tss__all_finite(const char *from, size_t count) {
+    for (size_t k = 0; k < count; k++) {
+        double v;
+        memcpy(&v, from + k * sizeof v, sizeof v);
+        if (!isfinite(v)) return 0;
+    }
+    return 1;
+}
+
+// A node that cannot be of this kind or pinned along these axes, or −1.
+static int tss__bad_kind(const tss_world *w, const uint8_t *kind, const uint8_t *axes) {
+    for (int i = 0; i < w->n; i++) {
+        const tss__bodydata *b = TSS__BODY(w, tss__i32(&w->body)[i]);
+        int fixed = b->kind == TSS_BODY_OBSTACLE || b->removed;
+        if (kind[i] > TSS_NODE_OBSTACLE || (kind[i] == TSS_NODE_OBSTACLE) != fixed) return i;
+        if (axes[i] >= (1 << w->dim) - 1 || (axes[i] && kind[i] != TSS_NODE_FREE)) return i;
+    }
+    return -1;
+}
+
+static int tss__drags_ok(const tss_world *w, const char *from, size_t drags) {
+    const char *k = from + drags * sizeof(int);
+    for (size_t i = 0; i < drags; i++) {
+        int node;
+        double stiffness;
+        memcpy(&node, from + i * sizeof node, sizeof node);
+        memcpy(&stiffness, k + i * sizeof stiffness, sizeof stiffness);
+        if (node < 0 || node >= w->n || !(stiffness > 0)) return 0;
+    }
+    return tss__all_finite(k, drags * (size_t)(w->dim + 1));
+}
+
+// 1: a permutation, 0: not, −1: no memory.
+static int tss__order_ok(tss_world *w, const char *from, int n) {
+    uint8_t *seen = (uint8_t *)tss__need(&w->host, &w->scratch, (size_t)n, 1);
+    if (!seen) return -1;
+    memset(seen, 0, (size_t)n);
+    for (int i = 0; i < n; i++) {
+        int v;
+        memcpy(&v, from + (size_t)i * sizeof v, sizeof v);
+        if (v < 0 || v >= n || seen[v]++) return 0;
+    }
+    return 1;
+}
+
+// What is out of range in the arrays of a checkpoint whose lengths are right, or NULL.
+static const char *tss__arrays_fault(const tss_world *w, const char *data, const tss__head *h) {
+    tss__layout l = tss__layout_of(w, h);
+    size_t n = (size_t)w->n;
+    const uint8_t *kind = (const uint8_t *)data + l.order - 2 * n;
+    if (tss__bad_kind(w, kind, kind + n) >= 0) return "a node's kind or pinned axes";
+    if (!tss__all_finite(data + l.arrays, 7 * n * (size_t)w->dim))
+        return "a position, velocity, target or force";
+    if (!tss__drags_ok(w, data + l.drags, (size_t)h->drags))
+        return "a dragged node, its stiffness or target";
+    return NULL;
+}
+
+// Everything that can be known of a checkpoint before anything of the world is written.
+static tss_result tss__load_check(tss_world *w, const char *data, size_t size) {
+    tss__head h;
+    if (size < sizeof h)
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %zu bytes are too few", size);
+    memcpy(&h, data, sizeof h);
+    tss_result r = tss__head_fits(w, &h);
+    if (r != TSS_OK) return r;
+    tss__layout l = tss__layout_of(w, &h);
+    int parts = w->entry_count + 1;
+    if (size < l.parts || !tss__load_parts(w, parts, data + l.parts, size - l.parts, 0))
+        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: cut short or of another scene");
+    const char *fault = tss__head_fault(w, &h);
+    if (!fault) fault = tss__arrays_fault(w, data, &h);
+    int permutes = tss__order_ok(w, data + l.order, (int)h.order);
+    if (permutes < 0) return tss__no_memory(w);
+    if (!fault && !permutes) fault = "the ordering";
+    if (!fault) return TSS_OK;
+    return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %s is out of range", fault);
+}
+
+// Takes a checkpoint that fits. Fails without memory, or where an energy refuses its part.
+static tss_result tss__load_apply(tss_world *w, const char *data, size_t size) {
+    tss__head h;
+    const tss__buf *list[9];
+    size_t bytes[9];
+    memcpy(&h, data, sizeof h);
+    tss__layout l = tss__layout_of(w, &h);
+    int count = tss__saved(w, list, bytes);
+    const char *from = data + l.arrays, *kinds = data + l.order - 2 * bytes[7];
+    if (memcmp(kinds, w->kind.p, bytes[7]) || memcmp(kinds + bytes[7], w->axes.p, bytes[8]))
+        w->prepared = 0;
+    for (int k = 0; k < count; k++) memcpy(list[k]->p, from, bytes[k]), from += bytes[k];
+    w->steps = h.steps, w->history = (int)h.history, w->time = h.time;
+    w->def.dt = h.dt, w->def.tol = h.tol;
+    w->ctx.ah2 = h.ah2, w->pcg_iterations = h.pcg_iterations, w->pcg_rest = (int)h.pcg_rest;
+    memcpy(w->def.gravity, h.gravity, sizeof h.gravity);
+    tss_result r = tss__drags_reserve(w, (size_t)h.drags);
+    if (r != TSS_OK) return r;
+    if (w->drags > 0 || h.drags > 0) w->drag_pattern++;
+    tss__copy_drags(w, (char *)(uintptr_t)(data + l.drags), (int)h.drags, 0);
+    w->drags = (int)h.drags;
+    r = tss__load_order(w, data + l.order, (int)h.order, h.order_flops);
+    if (r != TSS_OK) return tss_world_fail(w, r, "checkpoint: ordering: %s", tss_result_text(r));
+    if ((r = tss_world_prepare(w)) != TSS_OK) return r;
+    tss__fill_ctx(w);
+    if (!tss__load_parts(w, w->entry_count + 1, data + l.parts, size - l.parts, 1))
+        return tss_world_fail(w, TSS_ERROR_MISMATCH, "checkpoint: an energy refused its state");
+    return TSS_OK;
+}
+
 tss_result tss_world_load(tss_world *w, const void *data, size_t size) {
     if (!w || !data) return TSS_ERROR_BAD_ARGUMENT;
     tss_result r = tss_world_prepare(w);
+    if (r == TSS_OK) r = tss__load_check(w, (const char *)data, size);
     if (r != TSS_OK) return r;
-    tss__head h;
-    const tss__buf *list[9];
-    size_t bytes[9], fixed = sizeof h;
-    int count = tss__saved(w, list, bytes);
-    for (int k = 0; k < count; k++) fixed += bytes[k];
-    if (size < sizeof h) return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %zu bytes are too few", size);
-    memcpy(&h, data, sizeof h);
-    if (h.magic != TSS__MAGIC || h.version != 2)
-        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: not one of this version");
-    if (h.dim != (uint64_t)w->dim || h.n != (uint64_t)w->n || h.energies != (uint64_t)w->entry_count)
-        return tss_world_fail(w, TSS_ERROR_MISMATCH,
-                         "checkpoint: %llu nodes in %llu dimensions, %llu energies; the scene has %d, %d, %d",
-                         (unsigned long long)h.n, (unsigned long long)h.dim, (unsigned long long)h.energies,
-                         w->n, w->dim, w->entry_count);
-    if (h.order < 0 || h.order > w->n)
-        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: an ordering of %lld nodes", (long long)h.order);
-    if (h.drags < 0 || h.drags > w->n)
-        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: %lld dragged nodes", (long long)h.drags);
-    fixed += (size_t)h.order * sizeof(int) + (size_t)h.drags * tss__drag_bytes(w);
-    if (size < fixed || !tss__load_energies(w, (const char *)data + fixed, size - fixed, 0))
-        return tss_world_fail(w, TSS_ERROR_FORMAT, "checkpoint: cut short or of another scene");
-    const char *more = (const char *)data + fixed - (size_t)h.drags * tss__drag_bytes(w);
-    r = tss__drags_reserve(w, (size_t)h.drags);
-    if (r == TSS_OK) r = tss__load_order(w, more - (size_t)h.order * sizeof(int), (int)h.order, h.order_flops);
-    if (r != TSS_OK) return tss_world_fail(w, r, "checkpoint: ordering: %s", tss_result_text(r));
-    tss__copy_drags(w, (char *)(uintptr_t)more, (int)h.drags, 0);
-    w->drags = (int)h.drags, w->drag_pattern++, w->def.tol = h.tol;
-    const char *from = (const char *)data + sizeof h;
-    int kinds_change = memcmp(from + 7 * bytes[0], w->kind.p, bytes[7]) ||
-                       memcmp(from + 7 * bytes[0] + bytes[7], w->axes.p, bytes[8]);
-    for (int k = 0; k < count; k++) memcpy(list[k]->p, from, bytes[k]), from += bytes[k];
-    w->steps = h.steps, w->history = (int)h.history, w->time = h.time, w->def.dt = h.dt;
-    w->ctx.ah2 = h.ah2, w->pcg_iterations = h.pcg_iterations, w->pcg_rest = (int)h.pcg_rest;
-    memcpy(w->def.gravity, h.gravity, sizeof h.gravity);
-    if (kinds_change) {
-        w->prepared = 0;
-        if ((r = tss_world_prepare(w)) != TSS_OK) return r;
-    }
-    tss__fill_ctx(w);
-    if (!tss__load_energies(w, (const char *)data + fixed, size - fixed, 1))
-        return tss_world_fail(w, TSS_ERROR_MISMATCH, "checkpoint: an energy refused its state");
-    return TSS_OK;
+    // What only an energy can refuse: from a copy of the present state back to it.
+    size_t bytes = tss_world_save(w, NULL, 0);
+    char *before = (char *)tss_alloc(&w->host, bytes);
+    if (!before) return tss__no_memory(w);
+    tss_world_save(w, before, bytes);
+    r = tss__load_apply(w, (const char *)data, size);
+    if (r != TSS_OK) {
+        char why[sizeof w->error];
+        memcpy(why, w->error, sizeof why);
+        tss__load_apply(w, before, bytes);
+        memcpy(w->error, why, sizeof why);
+    } else
+        w->unchecked = 2;
+    tss_free(&w->host, before, bytes);
+    return r;
 }
 
 // The states of all energies, one after the other, through a buffer.
@@ -9716,6 +9988,7 @@ tss_result tss_world_copy_state(tss_world *to, const tss_world *from) {
     to->steps = from->steps, to->history = from->history, to->time = from->time;
     to->ctx.ah2 = from->ctx.ah2, to->def.dt = from->def.dt, to->def.tol = from->def.tol;
     memcpy(to->def.gravity, from->def.gravity, sizeof to->def.gravity);
+    to->unchecked = from->unchecked ? 2 : 0;
     tss__fill_ctx(to);
     return TSS_OK;
 }
@@ -9812,6 +10085,7 @@ tss_result tss_world_check(tss_world *w, tss_check_report *out) {
     if (!w || !out) return TSS_ERROR_BAD_ARGUMENT;
     memset(out, 0, sizeof *out);
     tss_result r = tss_world_prepare(w);
+    uint64_t refused = w->refused;
     if (r != TSS_OK) {
         char text[240];
         snprintf(text, sizeof text, "%.200s", w->error);
@@ -9829,6 +10103,7 @@ tss_result tss_world_check(tss_world *w, tss_check_report *out) {
         tss__entry *e = TSS__ENTRY(w, k);
         if (e->live && e->def.check) e->def.check(e->def.user, &w->ctx, tss__f64(&w->x), tss__report, out);
     }
+    if (w->refused != refused) return tss__no_memory(w);
     return TSS_OK;
 }
 
@@ -9934,7 +10209,8 @@ tss_result tss_energy_check(tss_world *w, tss_energy id, tss_energy_report *out)
     tss__fd f;
     f.w = w, f.e = TSS__ENTRY(w, id), f.x = tss__f64(&w->x_trial), f.S = f.e->def.arity * w->dim;
     r = f.e->def.lists(f.e->def.user, &w->ctx, f.x, NULL, 0, &f.e->list);
-    if (r == TSS_OK) tss__fd_floors(&f);
+    if (r != TSS_OK) return tss_world_fail(w, r, "%s: %s", f.e->name, tss_result_text(r));
+    tss__fd_floors(&f);
     for (f.id = 0; r == TSS_OK && f.id < f.e->list.count; f.id++) {
         double g[24], H[24 * 24], eg = INFINITY, eh = INFINITY;
         tss_ids ids;

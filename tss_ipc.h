@@ -820,8 +820,9 @@ void tss_ipc_tangents(int dim, const double *n, double *t) {
 // drops out of a − b. A poor n makes a step shorter, never wrong.
 // Rounding: the functions are built from x and d themselves, not from advanced positions, and each
 // is lowered by 8 eps of its terms' sizes (differences 1, products and sum 3, ‖n‖ 3, evaluation 1).
-// Limit: states are rounded to about eps · |coordinate| when stored; slack · distance must exceed
-// it. Cost: one closest-point evaluation a step; most pairs need one step.
+// Limit: states are rounded to about eps · |coordinate| when stored; slack · distance must exceed it
+// (contact in a world sees to that: >>collision_free_step).
+// Cost: one closest-point evaluation a step; most pairs need one step.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__CCD_ROUNDING (8 * DBL_EPSILON)
@@ -870,6 +871,36 @@ static double tss__sweep_time(const tss__sweep *s, tss__v3 n, double g) {
     return first;
 }
 
+// A direction to separate the pair along: r, made orthogonal to what it leaves. The rounding of far
+// ends turns a short r, and the same far ends magnify that. So: the normal of both edges, or of the
+// triangle, where r is as good as parallel to it (squared lengths to 1e-5, as in the lanes below);
+// else r without its part along the longer of the edges on whose inside a closest point lies.
+#define TSS__AS_NORMAL (1 - 1e-5)
+
+static tss__v3 tss__near_direction(tss_ipc_kind kind, const tss__v3 v[4], tss__near near) {
+    const tss__feature *all = tss__features[kind], *row = &all[(int)near.feature];
+    const tss__feature *inside = &all[tss__feature_count(kind) - 1];
+    tss__v3 e[2] = {{0, 0, 0}, {0, 0, 0}}, along = {0, 0, 0};
+    for (int k = 0; k < inside->params; k++) {
+        double D[4];
+        for (int i = 0; i < 4; i++) D[i] = inside->D[k][i];
+        e[k] = tss__v3_sum(D, v);
+    }
+    tss__v3 n = tss__v3_cross(e[0], e[1]);
+    double nn = tss__v3_dot(n, n), rn = tss__v3_dot(near.r, n);
+    if (nn > TSS__SIN2_NORMAL * tss__v3_dot(e[0], e[0]) * tss__v3_dot(e[1], e[1]) &&
+        rn * rn >= TSS__AS_NORMAL * nn * near.d)
+        return rn > 0 ? n : tss__v3_scale(-1, n);
+    for (int k = 0; k < row->params; k++) {
+        double D[4];
+        for (int i = 0; i < 4; i++) D[i] = row->D[k][i];
+        tss__v3 edge = tss__v3_sum(D, v);
+        if (tss__v3_dot(edge, edge) > tss__v3_dot(along, along)) along = edge;
+    }
+    double ee = tss__v3_dot(along, along);
+    return ee > 0 ? tss__v3_add(near.r, -tss__v3_dot(near.r, along) / ee, along) : near.r;
+}
+
 double tss_ipc_ccd(tss_ipc_kind kind, int dim, const double *x, const double *d, double slack,
                    double t_max, int max_iterations, int *iterations) {
     tss__v3 v[4], u[4], now[4];
@@ -882,8 +913,10 @@ double tss_ipc_ccd(tss_ipc_kind kind, int dim, const double *x, const double *d,
     for (i = 0; i < limit; i++) {
         for (int k = 0; k < 4; k++) now[k] = tss__v3_add(v[k], t, u[k]);
         tss__near near = tss__near_of(kind, now);
-        if (!(near.d > 0)) break;
-        tss__v3 n = tss__v3_scale(1 / sqrt(near.d), near.r);
+        tss__v3 n = tss__near_direction(kind, now, near);
+        double nn = tss__v3_dot(n, n);
+        if (!(near.d > 0 && nn > 0)) break;
+        n = tss__v3_scale(1 / sqrt(nn), n);
         double gap = tss__sweep_gap(&s, n, t);
         if (i == 0) g = slack * gap;
         if (!(gap > 0 && gap >= g)) break;
@@ -900,8 +933,9 @@ double tss_ipc_ccd(tss_ipc_kind kind, int dim, const double *x, const double *d,
     return t < t_max ? t : t_max;
 }
 
-double tss_ipc_ccd_plane(int dim, const double *x, const double *d, const double *o,
-                         const double *n, double slack, double t_max) {
+// As in public; the point stops at the distance least (‖n‖ = 1), or does not come nearer.
+static double tss__ccd_plane(int dim, const double *x, const double *d, const double *o,
+                             const double *n, double slack, double least, double t_max) {
     double gap = 0, speed = 0, size = 0, rate = 0;
     for (int i = 0; i < dim; i++) {
         gap += n[i] * (x[i] - o[i]), size += fabs(n[i] * (x[i] - o[i]));
@@ -910,8 +944,14 @@ double tss_ipc_ccd_plane(int dim, const double *x, const double *d, const double
     gap -= TSS__CCD_ROUNDING * size;
     speed -= TSS__CCD_ROUNDING * rate;
     if (!(gap > 0) || !(speed > -HUGE_VAL)) return 0;
-    double t = speed < 0 ? (1 - slack) * gap / -speed * (1 - 4 * DBL_EPSILON) : HUGE_VAL;
+    double way = gap - least < (1 - slack) * gap ? gap - least : (1 - slack) * gap;
+    double t = speed < 0 ? (way > 0 ? way : 0) / -speed * (1 - 4 * DBL_EPSILON) : HUGE_VAL;
     return t < t_max ? t : t_max;
+}
+
+double tss_ipc_ccd_plane(int dim, const double *x, const double *d, const double *o,
+                         const double *n, double slack, double t_max) {
+    return tss__ccd_plane(dim, x, d, o, n, slack, 0, t_max);
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -2723,11 +2763,11 @@ static tss_result tss__broad_search(tss__broad *b, const double *x, const double
 // Eight pairs at a time through branch-free distances. All kinds are two kernels: segment–segment
 // (a point is a segment of length zero) and point–triangle. Both give the vector u from the
 // closest point of a to that of b, which is
-//   near:  d = |u| < r, and
+//   near:  d = |u| < r (rounding aside: the narrow phase decides), and
 //   reach: a direction to separate the pair along. gap(s) = min_b u·x_b(s) − max_a u·x_a(s) is a
 //          minimum of linear functions of s, so concave: larger than g at both ends means larger
-//          than g in between, for any u, however inaccurate; |u| ≥ the true distance makes
-//          g = |u| · reach + eta · u·u large enough. Only the rounding of gap itself counts.
+//          than g in between, for any u, however inaccurate; |u| ≥ the true distance (to 1e-5)
+//          makes g = |u| · reach + eta · u·u large enough. Only the rounding of gap itself counts.
 // Cost: about 10 ns a pair. Near parallel segments may be taken for up to 1e-8 of their length
 // farther than they are; the narrow phase decides.
 // ---------------------------------------------------------------------------------------------
@@ -2833,14 +2873,24 @@ static void tss__broad_segments(tss__broad_lanes *g) {
         double s = tss__broad_clamp((cx * nx + cy * ny + cz * nz) / (nn > tiny ? nn : 1));
         double t = tss__broad_clamp((s * ab - wb) / (bb > tiny ? bb : 1));
         s = tss__broad_clamp((wa + t * ab) / (aa > tiny ? aa : 1));
-        g->u[0][k] = wx + t * bx - s * ax;
-        g->u[1][k] = wy + t * by - s * ay;
-        g->u[2][k] = wz + t * bz - s * az;
+        double ux = wx + t * bx - s * ax, uy = wy + t * by - s * ay, uz = wz + t * bz - s * az;
+        // As in tss__near_direction. s (1 − s) > 0: inside a.
+        double h = (wx * nx + wy * ny + wz * nz) / (nn > tiny ? nn : 1);
+        double uu = ux * ux + uy * uy + uz * uz, in_a = s * (1 - s), in_b = t * (1 - t);
+        double la = in_a > 0 ? aa : 0, lb = in_b > 0 ? bb : 0, ee = la > lb ? la : lb;
+        double ex = la > lb ? ax : bx, ey = la > lb ? ay : by, ez = la > lb ? az : bz;
+        double f = (ux * ex + uy * ey + uz * ez) / (ee > tiny ? ee : HUGE_VAL);
+        double enough = in_a * in_b > 0 ? 0 : TSS__AS_NORMAL * uu;
+        enough = nn > TSS__SIN2_NORMAL * aa * bb ? enough : DBL_MAX;
+        double hh = h * h * nn;
+        g->u[0][k] = hh >= enough ? h * nx : ux - f * ex;
+        g->u[1][k] = hh >= enough ? h * ny : uy - f * ey;
+        g->u[2][k] = hh >= enough ? h * nz : uz - f * ez;
     }
 }
 
-// Point 0 against triangle p[0], p[1], p[2]: u to the plane if the foot lies inside, else the
-// shortest of those to the three sides.
+// Point 0 against triangle p[0], p[1], p[2]: u to the plane if the foot lies inside (or outside by
+// next to nothing beside u), else the shortest of those to the three sides.
 static void tss__broad_triangles(tss__broad_lanes *g) {
     const double tiny = DBL_MIN;
     double best[8];
@@ -2852,6 +2902,9 @@ static void tss__broad_triangles(tss__broad_lanes *g) {
             double oe = o[0][k] * ex + o[1][k] * ey + o[2][k] * ez;
             double s = tss__broad_clamp(-oe / (ee > tiny ? ee : 1));
             double ux = o[0][k] + s * ex, uy = o[1][k] + s * ey, uz = o[2][k] + s * ez;
+            double along = ee > tiny ? ee : HUGE_VAL;
+            double f = (ux * ex + uy * ey + uz * ez) / (s * (1 - s) > 0 ? along : HUGE_VAL);
+            ux -= f * ex, uy -= f * ey, uz -= f * ez;
             double d = ux * ux + uy * uy + uz * uz;
             int take = i == 0 || d < best[k];
             best[k] = take ? d : best[k];
@@ -2873,6 +2926,8 @@ static void tss__broad_triangles(tss__broad_lanes *g) {
                      (ex * oy - ey * ox) * nz);
         double h = (ox * nx + oy * ny + oz * nz) / (nn > tiny ? nn : 1);
         int in = (nn > tiny) & (s >= 0) & (t >= 0) & (s + t <= nn);
+        double ee = ex * ex + ey * ey + ez * ez, ff = fx * fx + fy * fy + fz * fz;
+        in |= (nn > TSS__SIN2_NORMAL * ee * ff) & (h * h * nn >= TSS__AS_NORMAL * best[k]);
         g->u[0][k] = in ? h * nx : g->u[0][k];
         g->u[1][k] = in ? h * ny : g->u[1][k];
         g->u[2][k] = in ? h * nz : g->u[2][k];
@@ -3033,7 +3088,9 @@ static tss_result tss__broad_reach(tss__broad *b, int kind, const tss__broad_pai
 // ---------------------------------------------------------------------------------------------
 // >>collision_free_step (private)
 // The largest t such that no pair of a list comes nearer than slack · (its distance at x) on
-// x + s·d, s ∈ [0, t]: tss_ipc_ccd (its banner has the proof) eight pairs at a time. Each pair is
+// x + s·d, s ∈ [0, t], nor than `least`: a pair nearer already may only part. Least is what the
+// rounding of stored positions may take away. tss_ipc_ccd eight pairs at a time (its banner has the
+// proof). Each pair is
 // first advanced once; four in five are done then. The others are gathered into full lanes.
 // A pair that is safe up to the best t so far is dropped, so the result is the minimum over all
 // pairs whatever the order. Blocks run in waves of fixed size that hand on the best t.
@@ -3084,10 +3141,11 @@ static inline double tss__broad_fall(tss__broad_spot s, double floor) {
 
 // Lower bound of the distance at f->t along the closest vector there, and the time to which it
 // stays above the floor: each vertex of a against each of b, all moving linearly. At the start
-// the floor is −DBL_MAX and becomes slack times the bound; later slack is 0. Four short loops over
-// arrays of their own: in a longer one gcc threads the choices into branches and makes no vectors.
+// the floor is −DBL_MAX and becomes slack times the bound, or least; later both are 0. Four short
+// loops over arrays of their own: in a longer one gcc threads the choices into branches and makes
+// no vectors.
 static inline void tss__broad_advance_as(int triangle, const tss__broad_lanes *g, double slack,
-                                         tss__broad_front *f) {
+                                         double least, tss__broad_front *f) {
     tss__broad_spot of[4];
     tss__broad_front out;
     double nx[8], ny[8], nz[8], at[4][8], rate[4][8], fall[4][8];
@@ -3115,7 +3173,8 @@ static inline void tss__broad_advance_as(int triangle, const tss__broad_lanes *g
         rate[2][k] = of[2].rate, rate[3][k] = of[3].rate;
     }
     for (int k = 0; k < 8; k++) {
-        double low = slack * out.gap[k];
+        double low = slack * out.gap[k], room = tss__broad_min(least, out.gap[k]);
+        low = low > room ? low : room;
         out.floor[k] = low > f->floor[k] ? low : f->floor[k];
     }
     for (int k = 0; k < 8; k++) {
@@ -3135,10 +3194,10 @@ static inline void tss__broad_advance_as(int triangle, const tss__broad_lanes *g
     *f = out;
 }
 
-static void tss__broad_advance(const tss__broad_lanes *g, int kind, double slack,
+static void tss__broad_advance(const tss__broad_lanes *g, int kind, double slack, double least,
                                tss__broad_front *f) {
-    if (kind == TSS__BROAD_PT) tss__broad_advance_as(1, g, slack, f);
-    else tss__broad_advance_as(0, g, slack, f);
+    if (kind == TSS__BROAD_PT) tss__broad_advance_as(1, g, slack, least, f);
+    else tss__broad_advance_as(0, g, slack, least, f);
 }
 
 // Pairs waiting for full lanes, and the best so far of one block.
@@ -3170,7 +3229,7 @@ static void tss__broad_finish(const tss__broad_pass *s, tss__broad_queue *q, int
         tss__broad_move(g.p, g.v, f.t, now.p);
         tss__broad_closest(s->kind, &now);
         memcpy(g.u, now.u, sizeof g.u);
-        tss__broad_advance(&g, s->kind, 0, &f);
+        tss__broad_advance(&g, s->kind, 0, 0, &f);
         for (int k = 0; k < n; k++) {
             if (!(open >> k & 1)) continue;
             // near the floor further steps gain nothing, unless the whole way is free
@@ -3217,7 +3276,7 @@ static void tss__broad_step_task(int task, int worker, void *arg) {
             tss__broad_front f;
             for (int k = 0; k < 8; k++) f.t[k] = 0, f.floor[k] = -DBL_MAX;
             tss__broad_closest(s->kind, &g[j]);
-            tss__broad_advance(&g[j], s->kind, s->eta, &f);
+            tss__broad_advance(&g[j], s->kind, s->eta, s->reach, &f);
             tss__broad_enqueue(s, 8 * (i + j), n - 8 * j < 8 ? n - 8 * j : 8, &f, &q);
         }
     }
@@ -3240,9 +3299,9 @@ static void tss__broad_wave(tss__broad_pass *s, int first, int n, int *culprit) 
 // The largest time in [0, t] as above for the pairs of in (all of one kind); *culprit (may be
 // NULL): the place in the list of the pair that limits it, −1: none. 0: a pair touches at x.
 static double tss__broad_step(tss__broad *b, int kind, const tss__broad_pairs *in, const double *x,
-                              const double *d, double slack, double t, int *culprit) {
+                              const double *d, double slack, double least, double t, int *culprit) {
     const int wave = 32;
-    tss__broad_pass s = {b, kind, 0, in->count, 0, 1, x, d, t, 0, slack, in->pair, NULL};
+    tss__broad_pass s = {b, kind, 0, in->count, 0, 1, x, d, t, least, slack, in->pair, NULL};
     if (culprit) *culprit = -1;
     if (!in->count) return t;
     s.blocks = tss__broad_blocks((in->count - 1) / 8 + 1, 64);
@@ -3277,7 +3336,8 @@ extern "C" {
 // Data flow of a Newton iterate:
 //   lists(x)        active pairs at x: filtered from the last sweep's if x lies on it, else found
 //   lists(x, d, t)  sweep of the broad phase; pairs that may come nearer than d̂ on it ("kept");
-//                   additive CCD over them; again those on the part of the path that is free
+//                   additive CCD over them, and over pairs without a free node that move against
+//                   each other ("fixed"); again those kept on the part of the path that is free
 //   max_step        the step found there: nothing may be evaluated beyond it
 //   after_iterate   active pairs at the new state, their least distance, κ
 // A stencil keeps its nodes; which parts are closest is decided at each evaluation, so the energy
@@ -3290,11 +3350,12 @@ extern "C" {
 //   at the start of a step with contacts κ = −(g_c·g_E)/‖g_c‖² / αh² clamped to [κ_min, κ_max], g_c
 //   = ∇B and g_E the gradient of everything else; × 2 when a pair's distance stays below 1e-9 l and
 //   shrinks.
-// Quasi-static: αh² = 1 and no inertia, so masses say nothing: no upper bound, and κ never falls.
+// Quasi-static: αh² = 1 and no inertia, so masses say nothing: forces bound κ, and it never falls.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__IPC_COOKIE 0x69706331
-enum { TSS__IPC_PLANE = 4, TSS__IPC_KINDS = 5 };  // after the broad phase's four kinds
+// after the broad phase's four kinds
+enum { TSS__IPC_PLANE = 4, TSS__IPC_KINDS = 5, TSS__IPC_FIXED = 5 };
 
 // A grow-only array; the content is lost when it grows.
 typedef struct tss__ipc_array {
@@ -3332,6 +3393,9 @@ struct tss_ipc {
     tss__broad broad;
     tss__ipc_array kinematic, self_off, body_of;
     int bodies;
+    tss__broad fixed;  // primitives without a free node; their pairs only limit steps
+    tss__ipc_array fixed_node, fixed_body, fixed_off;
+    int fixed_pairs;   // some of them may meet
     double dhat, mass, diagonal, eps_v;
     const char *dhat_from;
 
@@ -3343,7 +3407,8 @@ struct tss_ipc {
     uint64_t pattern;
     double t_cover;           // the sweep covers [0, t_cover] of what was asked
     double t_step;            // largest collision-free step on it
-    int culprit[3];           // the pair that limits it: kind (−1: none) and its two numbers
+    int culprit[4];           // the pair that limits it: kind (−1: none), its two numbers, and the
+                              // kind in `fixed` if kind is TSS__IPC_FIXED
     int swept;                // kept is valid on the path of the last sweep
     tss__ipc_array x_active;  // state that active belongs to
     int active_known;
@@ -3488,19 +3553,73 @@ static tss_result tss__ipc_set_mesh(tss_ipc *p, const tss_ctx *c) {
     return tss__broad_set_mesh(&p->broad, &m);
 }
 
+// The primitives of count × arity nodes all of which are kinematic, to `to`; returns their number.
+static int tss__ipc_pick_fixed(const tss_ipc *p, const int *node, int count, int arity, int *to) {
+    const uint8_t *fixed = (const uint8_t *)p->kinematic.p;
+    int kept = 0;
+    for (int i = 0; i < count; i++) {
+        int all = 1;
+        for (int k = 0; k < arity; k++) all = all && fixed[node[i * arity + k]];
+        for (int k = 0; all && k < arity; k++) to[kept * arity + k] = node[i * arity + k];
+        kept += all;
+    }
+    return kept;
+}
+
+// Bodies of kinematic nodes only become one body that does not meet itself: they pass through each
+// other. loose: of them, which have a free node.
+static tss_result tss__ipc_fixed_bodies(tss_ipc *p, const tss_ctx *c) {
+    const int *body = (const int *)p->body_of.p;
+    const uint8_t *kinematic = (const uint8_t *)p->kinematic.p;
+    size_t n = (size_t)c->nodes, all = (size_t)p->bodies + 1;
+    int *to = (int *)tss__ipc_fit(p->host, &p->fixed_body, n * sizeof(int));
+    uint8_t *off = (uint8_t *)tss__ipc_fit(p->host, &p->fixed_off, 2 * all), *loose = off + all;
+    if (!to || !off) return TSS_ERROR_NO_MEMORY;
+    memset(loose, 0, all);
+    p->fixed_pairs = 0;
+    for (int i = 0; i < c->nodes; i++) loose[body[i]] |= !kinematic[i];
+    for (int i = 0; i < c->nodes; i++) {
+        to[i] = loose[body[i]] ? body[i] : p->bodies;
+        p->fixed_pairs |= kinematic[i] && loose[body[i]];
+    }
+    memcpy(off, p->self_off.p, (size_t)p->bodies);
+    off[p->bodies] = 1;
+    return TSS_OK;
+}
+
+// The mesh of `fixed`. Where every kinematic node belongs to a wholly kinematic body there is none.
+static tss_result tss__ipc_set_fixed(tss_ipc *p, const tss_ctx *c) {
+    const tss_surface *s = &p->surface;
+    tss__broad_mesh m;
+    tss_result r = tss__ipc_fixed_bodies(p, c);
+    if (r != TSS_OK || !p->fixed_pairs) return r;
+    size_t most = (size_t)s->points + 2 * (size_t)s->edges + 3 * (size_t)s->triangles;
+    int *point = (int *)tss__ipc_fit(p->host, &p->fixed_node, most * sizeof(int));
+    if (!point) return TSS_ERROR_NO_MEMORY;
+    int *edge = point + s->points, *tri = edge + 2 * (size_t)s->edges;
+    memset(&m, 0, sizeof m);
+    m.dim = c->dim, m.nodes = c->nodes, m.point = point, m.edge = edge, m.tri = tri;
+    m.points = tss__ipc_pick_fixed(p, s->point, s->points, 1, point);
+    m.edges = tss__ipc_pick_fixed(p, s->edge, s->edges, 2, edge);
+    m.tris = tss__ipc_pick_fixed(p, s->triangle, s->triangles, 3, tri);
+    m.body = (const int *)p->fixed_body.p, m.self_off = (const uint8_t *)p->fixed_off.p;
+    return tss__broad_set_mesh(&p->fixed, &m);
+}
+
 static tss_result tss__ipc_refresh(tss_ipc *p, const tss_ctx *c) {
     if (p->failed) {
         p->failed = 0;
         return TSS_ERROR_NO_MEMORY;
     }
     if (p->topology == c->topology && p->dhat > 0) return TSS_OK;
+    p->active_known = p->swept = 0, p->closes = 0, p->h = 0;  // queries wait for a step
     tss_result r = tss_world_surface(p->world, &p->surface);
     if (r == TSS_OK) r = tss__ipc_set_mesh(p, c);
+    if (r == TSS_OK) r = tss__ipc_set_fixed(p, c);
     if (r != TSS_OK) return r;
     tss__ipc_choose_dhat(p, c);
     p->mass = tss__ipc_mean_mass(c), p->diagonal = c->diagonal;
     p->eps_v = p->def.eps_v > 0 ? p->def.eps_v : 1e-3 * c->diagonal;
-    p->active_known = p->swept = 0, p->closes = 0;
     p->topology = c->topology;
     return p->dhat > 0 ? TSS_OK : TSS_ERROR_EMPTY;
 }
@@ -3543,15 +3662,18 @@ static tss_result tss__ipc_list_planes(tss_ipc *p, const tss_ctx *c, const doubl
 }
 
 // Removes pairs of bodies that pass through each other.
-static void tss__ipc_exclude(tss_ipc *p, int kind, tss__broad_pairs *list) {
+static int tss__ipc_excluded(const tss_ipc *p, int kind, const int v[4]) {
     const int *body = (const int *)p->body_of.p;
+    const tss_ipc_pair *q = tss__ipc_pair_of(p, body[v[0]], body[v[kind == TSS__BROAD_EE ? 2 : 1]]);
+    return q && q->exclude;
+}
+
+static void tss__ipc_exclude(tss_ipc *p, int kind, tss__broad_pairs *list) {
     int kept = 0;
     for (int i = 0; i < list->count; i++) {
         int v[4];
         tss__broad_nodes(&p->broad.mesh, kind, list->pair[i], v);
-        int second = kind == TSS__BROAD_EE ? v[2] : v[1];
-        const tss_ipc_pair *q = tss__ipc_pair_of(p, body[v[0]], body[second]);
-        if (!q || !q->exclude) list->pair[kept++] = list->pair[i];
+        if (!tss__ipc_excluded(p, kind, v)) list->pair[kept++] = list->pair[i];
     }
     list->count = kept;
 }
@@ -3569,7 +3691,10 @@ static tss_result tss__ipc_hand_out(tss_ipc *p, const tss_ctx *c, tss__ipc_list 
     tss__ipc_array spare = p->node_old;
     p->node_old = p->node, p->node = spare;
     int *node = (int *)tss__ipc_fit(p->host, &p->node, bytes);
-    if (!node) return TSS_ERROR_NO_MEMORY;
+    if (!node) {  // what was handed out last stays what the next is compared with
+        spare = p->node, p->node = p->node_old, p->node_old = spare;
+        return TSS_ERROR_NO_MEMORY;
+    }
     for (int k = 0; k < TSS__IPC_PLANE; k++)
         for (int i = 0; i < l->pair[k].count; i++, at += arity) {
             int v[4];
@@ -3587,19 +3712,24 @@ static tss_result tss__ipc_hand_out(tss_ipc *p, const tss_ctx *c, tss__ipc_list 
     return TSS_OK;
 }
 
-// Broad phase over x + t·d. More pairs than allowed: the sweep is halved until they fit; a sweep of
-// a millionth (or a single state) takes what it needs.
-static tss_result tss__ipc_search(tss_ipc *p, const double *x, const double *d, double *t) {
+// Broad phase over x + t·d, boxes grown. More pairs than allowed: the sweep is halved until they
+// fit; a sweep of a millionth (or a single state) takes what it needs.
+static tss_result tss__ipc_cover(tss_ipc *p, tss__broad *b, const double *x, const double *d,
+                                 double grow, double *t) {
     int over = 1, cut = 0;
     tss_result r = TSS_OK;
     for (int k = 0; over && r == TSS_OK; k++) {
         int free_run = !d || k >= 20;
-        r = tss__broad_search(&p->broad, x, d, *t, 0.5 * p->dhat,
-                              free_run ? INT_MAX : p->def.max_candidates, &over);
+        r = tss__broad_search(b, x, d, *t, grow, free_run ? INT_MAX : p->def.max_candidates, &over);
         if (over && !free_run) *t *= 0.5, cut = 1;
         if (over && free_run) return TSS_ERROR_NO_MEMORY;
     }
     p->shortened += cut;
+    return r;
+}
+
+static tss_result tss__ipc_search(tss_ipc *p, const double *x, const double *d, double *t) {
+    tss_result r = tss__ipc_cover(p, &p->broad, x, d, 0.5 * p->dhat, t);
     p->candidates = 0;
     for (int k = 0; k < 4; k++) p->candidates += p->broad.list[k].count;
     return r;
@@ -3616,14 +3746,26 @@ static void tss__ipc_entry(const tss__ipc_list *l, int k, int i, int key[3]) {
     key[2] = k == TSS__IPC_PLANE ? q[0] : l->pair[k].pair[i].b;
 }
 
+// More than two primitives can lose of their distance when x + t·d is rounded to be stored: half a
+// unit in the last place of the product and of the sum, in three coordinates of both.
+static double tss__ipc_rounding(const tss_ctx *c, const double *x, const double *d, double t) {
+    double most = 0;
+    for (int i = 0; i < c->nodes * c->dim; i++) {
+        double s = fabs(x[i]) + t * fabs(d[i]);
+        most = s > most ? s : most;
+    }
+    return 8 * DBL_EPSILON * most;
+}
+
 // The largest step up to t that leaves every kept pair its slack and every point its side.
 static double tss__ipc_limit(tss_ipc *p, const tss_ctx *c, const double *x, const double *d,
                              double t) {
     const tss__ipc_list *l = &p->kept;
+    double least = tss__ipc_rounding(c, x, d, t);
     p->culprit[0] = -1;
     for (int k = 0; k < 4; k++) {
         int who = -1;
-        double s = tss__broad_step(&p->broad, k, &l->pair[k], x, d, p->def.slack, t, &who);
+        double s = tss__broad_step(&p->broad, k, &l->pair[k], x, d, p->def.slack, least, t, &who);
         if (s < t && who >= 0) tss__ipc_entry(l, k, who, p->culprit);
         t = s < t ? s : t;
     }
@@ -3631,10 +3773,62 @@ static double tss__ipc_limit(tss_ipc *p, const tss_ctx *c, const double *x, cons
         const int *v = (const int *)l->plane.p + 2 * i;
         const tss_ipc_plane *q = &p->plane[v[1]];
         size_t at = (size_t)v[0] * (size_t)c->dim;
-        double s = tss_ipc_ccd_plane(c->dim, x + at, d + at, q->origin, q->normal, p->def.slack, t);
+        double s = tss__ccd_plane(c->dim, x + at, d + at, q->origin, q->normal, p->def.slack, least,
+                                  t);
         if (s < t) t = s, tss__ipc_entry(l, TSS__IPC_PLANE, i, p->culprit);
     }
     return t;
+}
+
+// Do the two parts of a kinematic pair move against each other? Rounding of common motion does not
+// count. Pairs that lay nearer than `least` at the start of the step are glued: left alone.
+static int tss__ipc_parts(const tss_ipc *p, const tss_ctx *c, int kind, const int v[4],
+                          const double *x, const double *d, double least) {
+    double y[12], size = 0, apart = 0;
+    for (int i = 0; i < tss_ipc_pair_nodes((tss_ipc_kind)kind); i++)
+        for (int a = 0; a < c->dim; a++) {
+            double s = d[v[i] * c->dim + a], o = d[v[0] * c->dim + a];
+            double at = fabs(x[v[i] * c->dim + a]);
+            y[i * c->dim + a] = c->x_t[v[i] * c->dim + a];
+            apart = fabs(s - o) > apart ? fabs(s - o) : apart;
+            size = at + fabs(s) > size ? at + fabs(s) : size;
+        }
+    if (!(apart > 8 * DBL_EPSILON * size) || tss__ipc_excluded(p, kind, v)) return 0;
+    return tss_ipc_distance((tss_ipc_kind)kind, c->dim, y, NULL) >= least * least;
+}
+
+// Steps are also limited by pairs without a free node, unless both bodies are wholly kinematic: what
+// hangs on a pinned node would be run through with it. They have no energy, so they stop where
+// d̂/1000 is left, and are glued if half of that was missing at the start of the step.
+static tss_result tss__ipc_limit_fixed(tss_ipc *p, const tss_ctx *c, const double *x,
+                                       const double *d) {
+    const uint8_t *kinematic = (const uint8_t *)p->kinematic.p;
+    double fastest = 0;
+    for (int i = 0; p->fixed_pairs && i < c->nodes * c->dim; i++)
+        if (kinematic[i / c->dim] && fabs(d[i]) > fastest) fastest = fabs(d[i]);
+    if (!(fastest > 0) || !(p->t_step > 0)) return TSS_OK;
+    double round = tss__ipc_rounding(c, x, d, p->t_step), least = 1e-3 * p->dhat;
+    least = least > 4 * round ? least : 4 * round;
+    tss_result r = tss__ipc_cover(p, &p->fixed, x, d, 0.5 * least, &p->t_step);
+    // Free points meet surfaces only: a body with free nodes has no other primitives.
+    for (int k = 0; k < TSS__BROAD_PP && r == TSS_OK; k++) {
+        tss__broad_pairs *l = &p->fixed.list[k];
+        int kept = 0, who = -1;
+        for (int i = 0; i < l->count; i++) {
+            int v[4];
+            tss__broad_nodes(&p->fixed.mesh, k, l->pair[i], v);
+            if ((k != TSS__BROAD_PE || c->dim == 2) &&
+                tss__ipc_parts(p, c, k, v, x, d, 0.5 * least))
+                l->pair[kept++] = l->pair[i];
+        }
+        l->count = kept;
+        double s = tss__broad_step(&p->fixed, k, l, x, d, 0, least, p->t_step, &who);
+        if (!(s < p->t_step)) continue;
+        if (s * fastest < 0.01 * least) s = 0;  // as near as it gets: no creeping up
+        p->t_step = s, p->culprit[0] = TSS__IPC_FIXED, p->culprit[3] = k;
+        p->culprit[1] = l->pair[who].a, p->culprit[2] = l->pair[who].b;
+    }
+    return r;
 }
 
 // kept = the pairs of in that may come nearer than d̂ on x + s·d, s ∈ [0, t].
@@ -3658,7 +3852,8 @@ static tss_result tss__ipc_sweep(tss_ipc *p, const tss_ctx *c, const double *x, 
     if (r == TSS_OK) r = tss__ipc_keep(p, c, x, d, p->t_cover, 0);
     if (r != TSS_OK) return r;
     p->t_step = tss__ipc_limit(p, c, x, d, p->t_cover);
-    if (p->t_step < 0.5 * p->t_cover) r = tss__ipc_keep(p, c, x, d, p->t_step, 1);
+    r = tss__ipc_limit_fixed(p, c, x, d);
+    if (r == TSS_OK && p->t_step < 0.5 * p->t_cover) r = tss__ipc_keep(p, c, x, d, p->t_step, 1);
     p->swept = r == TSS_OK;
     return r;
 }
@@ -3852,6 +4047,10 @@ static double tss__ipc_max_step(void *user, const tss_ctx *c, const double *x, c
     *culprit = -1;
     if (!p->swept) return 0;
     if (t_max <= p->t_step) return t_max;
+    if (p->culprit[0] == TSS__IPC_FIXED) {
+        *culprit = l->start[TSS__IPC_KINDS];  // one past the list
+        return p->t_step;
+    }
     for (int k = p->culprit[0], i = k < 0 ? 0 : l->start[k]; k >= 0 && i < l->start[k + 1]; i++) {
         int key[3];
         tss__ipc_entry(l, k, i - l->start[k], key);
@@ -3866,11 +4065,34 @@ static double tss__ipc_max_step(void *user, const tss_ctx *c, const double *x, c
 // >>contact_stiffness (private)
 // ---------------------------------------------------------------------------------------------
 
+// Squared distance at which IPC's rule sees the barrier: 1e-8 l, but well inside a very small d̂.
+static double tss__ipc_small(const tss_ipc *p, const tss_ctx *c) {
+    double by_size = 1e-16 * c->diagonal * c->diagonal, by_reach = 1e-2 * p->dhat * p->dhat;
+    return by_size < by_reach ? by_size : by_reach;
+}
+
+// Barrier force for κ = 1 at a distance.
+static double tss__ipc_force_at(const tss_ipc *p, double distance) {
+    tss__barrier b = tss__barrier_of(distance * distance, p->dhat * p->dhat);
+    return 2 * distance * fabs(b.b1);
+}
+
+// Quasi-static: masses do not bound κ, but no force needs more than a thousand times the κ that
+// holds the largest load or elastic force on a node at d̂/10.
+static double tss__ipc_quasistatic_max(const tss_ipc *p, const tss_ctx *c) {
+    double most = 100 * p->kappa_min, f = 0;
+    for (int i = 0; c->g && i < c->nodes * c->dim; i++)
+        if (c->kind[i / c->dim] == TSS_NODE_FREE) f = fabs(c->g[i]) > f ? fabs(c->g[i]) : f;
+    double by_force = 1000 * f / tss__ipc_force_at(p, 0.1 * p->dhat) / c->ah2;
+    most = by_force > most ? by_force : most;
+    return p->kappa > most ? p->kappa : most;
+}
+
 static void tss__ipc_kappa_bounds(tss_ipc *p, const tss_ctx *c) {
-    double l2 = c->diagonal * c->diagonal;
-    tss__barrier b = tss__barrier_of(1e-16 * l2, p->dhat * p->dhat);
-    p->kappa_min = b.b2 > 0 && p->mass > 0 ? 1e11 * p->mass / (4e-16 * l2 * b.b2) / c->ah2 : 0;
-    p->kappa_max = c->quasistatic ? HUGE_VAL : 100 * p->kappa_min;
+    double small = tss__ipc_small(p, c);
+    tss__barrier b = tss__barrier_of(small, p->dhat * p->dhat);
+    p->kappa_min = 1e11 * p->mass / (4 * small * b.b2) / c->ah2;
+    p->kappa_max = c->quasistatic ? tss__ipc_quasistatic_max(p, c) : 100 * p->kappa_min;
 }
 
 // ∇B (κ = 1) of the active pairs at x into g, n × dim; in list order: the same bits always.
@@ -3958,7 +4180,7 @@ static int tss__ipc_shrinks(const tss__ipc_close *old, int olds, const tss__ipc_
 
 static int tss__ipc_double_kappa(tss_ipc *p, const tss_ctx *c) {
     const double *d = (const double *)p->distance.p;
-    double limit = 1e-18 * c->diagonal * c->diagonal;
+    double limit = 1e-2 * tss__ipc_small(p, c);
     int count = p->active.start[TSS__IPC_KINDS], closes = 0, shrinks = 0;
     if (p->def.kappa > 0 || !(p->min_distance * p->min_distance < limit)) {
         p->closes = 0;
@@ -3982,48 +4204,6 @@ static int tss__ipc_double_kappa(tss_ipc *p, const tss_ctx *c) {
     p->doubled++;
     return 1;
 }
-
-// Pairs that stay far inside d̂ make Newton's method slow: the distance then changes by its own
-// size over a step that is tiny for everything else, and one tip can hold a whole body to steps of
-// 1 %. Three iterates in a row with a pair nearer than d̂/20 raise κ until the present force would be
-// held at d̂/10 (at most eightfold at once, never beyond κ_max). Tried on the mat that falls on
-// knives: 114 iterates a step without, 14 with. Doubling at 1e-9 l, IPC's own rule, comes too late.
-#define TSS__IPC_THIN 0.05
-
-// Barrier force for κ = 1 at a distance.
-static double tss__ipc_force_at(const tss_ipc *p, double distance) {
-    tss__barrier b = tss__barrier_of(distance * distance, p->dhat * p->dhat);
-    return 2 * distance * fabs(b.b1);
-}
-
-static int tss__ipc_stiffen(tss_ipc *p) {
-    p->thin = p->min_distance < TSS__IPC_THIN * p->dhat ? p->thin + 1 : 0;
-    if (p->def.kappa > 0 || p->thin < 3 || !(p->kappa < p->kappa_max)) return 0;
-    double ratio = tss__ipc_force_at(p, p->min_distance) / tss__ipc_force_at(p, 0.1 * p->dhat);
-    ratio = ratio < 2 ? 2 : ratio > 8 ? 8 : ratio;
-    p->kappa = ratio * p->kappa < p->kappa_max ? ratio * p->kappa : p->kappa_max;
-    p->thin = 0, p->doubled++;
-    return 1;
-}
-
-static int tss__ipc_after_iterate(void *user, const tss_ctx *c, const double *x0,
-                                  const double *x1) {
-    tss_ipc *p = (tss_ipc *)user;
-    (void)x0;
-    if (tss__ipc_find_active(p, c, x1, 1) != TSS_OK) {
-        p->failed = 1, p->active_known = 0;
-        return 0;
-    }
-    int doubled = tss__ipc_double_kappa(p, c);
-    return tss__ipc_stiffen(p) || doubled;
-}
-
-// ---------------------------------------------------------------------------------------------
-// >>contact_friction (private)
-// D = Σ μ λ f0(‖u‖), u = (I − n nᵀ) Σ c_i (x_i − x_t,i); λ = κ m |∂b/∂distance|, n and c frozen.
-// u is the displacement since the start of the step for every integrator, its threshold ε_v h.
-// Hessian: c cᵀ ⊗ [f2 û ûᵀ + f1/‖u‖ (n × û)(n × û)ᵀ]: positive semi-definite as it stands.
-// ---------------------------------------------------------------------------------------------
 
 // Closest points of an active stencil at x: coefficients, normal, force λ per κ.
 typedef struct tss__ipc_touching {
@@ -4068,6 +4248,62 @@ static void tss__ipc_touching_of(const tss_ipc *p, const tss_ctx *c, const doubl
     tss_ipc_barrier(d, p->dhat * p->dhat, &b1, NULL);
     o->force = -2 * o->distance * m * b1;
 }
+
+// Pairs that stay far inside d̂ make Newton's method slow: the distance then changes by its own
+// size over a step that is tiny for everything else, and one tip can hold a whole body to steps of
+// 1 %. Three iterates in a row with a pair nearer than d̂/20 raise κ until the present force would be
+// held at d̂/10 (at most eightfold at once, never beyond κ_max). Tried on the mat that falls on
+// knives: 114 iterates a step without, 14 with. Doubling at 1e-9 l, IPC's own rule, comes too late.
+#define TSS__IPC_THIN 0.05
+
+// Least distance, below the limit, of the active pairs whose closest points move with a free node.
+// A pinned tip by a wall stays where it is whatever κ is.
+static double tss__ipc_least_free(const tss_ipc *p, const tss_ctx *c, const double *x,
+                                  double limit) {
+    const double *d = (const double *)p->distance.p;
+    double least = limit * limit;
+    for (int i = 0; i < p->active.start[TSS__IPC_KINDS]; i++) {
+        tss__ipc_touching t;
+        double moves = 0;
+        if (!(d[i] < least)) continue;
+        tss__ipc_touching_of(p, c, x, i, &t);
+        for (int k = 0; k < 4; k++)
+            if (t.node[k] >= 0 && c->kind[t.node[k]] == TSS_NODE_FREE) moves += fabs(t.c[k]);
+        if (moves > 0.01) least = d[i];
+    }
+    return sqrt(least);
+}
+
+static int tss__ipc_stiffen(tss_ipc *p, const tss_ctx *c, const double *x) {
+    double limit = TSS__IPC_THIN * p->dhat;
+    double least = p->min_distance < limit ? tss__ipc_least_free(p, c, x, limit) : limit;
+    p->thin = least >= limit ? 0 : p->thin < 3 ? p->thin + 1 : 3;
+    if (p->def.kappa > 0 || p->thin < 3 || !(p->kappa < p->kappa_max)) return 0;
+    double ratio = tss__ipc_force_at(p, least) / tss__ipc_force_at(p, 0.1 * p->dhat);
+    ratio = ratio < 2 ? 2 : ratio > 8 ? 8 : ratio;
+    p->kappa = ratio * p->kappa < p->kappa_max ? ratio * p->kappa : p->kappa_max;
+    p->thin = 0, p->doubled++;
+    return 1;
+}
+
+static int tss__ipc_after_iterate(void *user, const tss_ctx *c, const double *x0,
+                                  const double *x1) {
+    tss_ipc *p = (tss_ipc *)user;
+    (void)x0;
+    if (tss__ipc_find_active(p, c, x1, 1) != TSS_OK) {
+        p->failed = 1, p->active_known = 0;
+        return 0;
+    }
+    int doubled = tss__ipc_double_kappa(p, c);
+    return tss__ipc_stiffen(p, c, x1) || doubled;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>contact_friction (private)
+// D = Σ μ λ f0(‖u‖), u = (I − n nᵀ) Σ c_i (x_i − x_t,i); λ = κ m |∂b/∂distance|, n and c frozen.
+// u is the displacement since the start of the step for every integrator, its threshold ε_v h.
+// Hessian: c cᵀ ⊗ [f2 û ûᵀ + f1/‖u‖ (n × û)(n × û)ᵀ]: positive semi-definite as it stands.
+// ---------------------------------------------------------------------------------------------
 
 static double tss__ipc_mu_of(const tss_ipc *p, const tss__ipc_touching *t) {
     if (t->kind != TSS__IPC_PLANE) return tss__ipc_mu(p, t->a, t->b);
@@ -4284,14 +4520,9 @@ static double tss__ipc_clearance(void *user, const tss_ctx *c, const double *x) 
     return p->min_distance < p->dhat ? p->min_distance : HUGE_VAL;
 }
 
-static void tss__ipc_describe(void *user, const tss_ctx *c, int id, char *text, size_t size) {
-    const tss_ipc *p = (const tss_ipc *)user;
-    int v[4], kind;
-    if (!p->current || id < 0 || id >= p->current->start[TSS__IPC_KINDS]) {
-        snprintf(text, size, "contact %d", id);
-        return;
-    }
-    tss__ipc_stencil_nodes(p, p->current, id, v, &kind);
+// Node and primitive, or plane, in words.
+static void tss__ipc_name_pair(const tss_ctx *c, int kind, const int v[4], char *text,
+                               size_t size) {
     const int *b = c->body;
     switch (kind) {
         case TSS__BROAD_EE:
@@ -4316,6 +4547,23 @@ static void tss__ipc_describe(void *user, const tss_ctx *c, int id, char *text, 
     }
 }
 
+static void tss__ipc_describe(void *user, const tss_ctx *c, int id, char *text, size_t size) {
+    const tss_ipc *p = (const tss_ipc *)user;
+    int v[4], kind;
+    if (p->current && p->culprit[0] == TSS__IPC_FIXED && id == p->current->start[TSS__IPC_KINDS]) {
+        tss__pair q = {p->culprit[1], p->culprit[2]};
+        tss__broad_nodes(&p->fixed.mesh, p->culprit[3], q, v);
+        tss__ipc_name_pair(c, p->culprit[3], v, text, size);
+        return;
+    }
+    if (!p->current || id < 0 || id >= p->current->start[TSS__IPC_KINDS]) {
+        snprintf(text, size, "contact %d", id);
+        return;
+    }
+    tss__ipc_stencil_nodes(p, p->current, id, v, &kind);
+    tss__ipc_name_pair(c, kind, v, text, size);
+}
+
 static void tss__ipc_friction_describe(void *user, const tss_ctx *c, int id, char *text,
                                        size_t size) {
     const tss_ipc *p = (const tss_ipc *)user;
@@ -4325,16 +4573,19 @@ static void tss__ipc_friction_describe(void *user, const tss_ctx *c, int id, cha
     snprintf(text, size, "friction at node %d", v);
 }
 
-// κ is all that a step takes over from the one before: lists, lagged forces and the rest are made
-// anew from the state at its start.
+static int tss__ipc_not_negative(double v) { return v >= 0 && v < HUGE_VAL; }
+
+// κ, and for how long some pair was thin, is all that a step takes over from the one before: lists,
+// lagged forces and the rest are made anew from the state at its start.
 typedef struct tss__ipc_saved {
     uint64_t magic;
     double kappa;
+    int64_t thin;
 } tss__ipc_saved;
 
 static size_t tss__ipc_state(void *user, void *data, size_t size, int save) {
     tss_ipc *p = (tss_ipc *)user;
-    tss__ipc_saved s = {0x3163706973737431ULL, p->kappa};
+    tss__ipc_saved s = {0x3163706973737432ULL, p->kappa, p->thin};
     if (!data) return sizeof s;
     if (size < sizeof s) return 0;
     if (save) {
@@ -4343,8 +4594,12 @@ static size_t tss__ipc_state(void *user, void *data, size_t size, int save) {
     }
     tss__ipc_saved in;
     memcpy(&in, data, sizeof in);
-    if (in.magic != s.magic || !(in.kappa >= 0)) return 0;
-    p->kappa = in.kappa, p->active_known = p->swept = 0;
+    if (in.magic != s.magic || !tss__ipc_not_negative(in.kappa)) return 0;
+    if (in.thin < 0 || in.thin > 3) return 0;
+    p->kappa = in.kappa, p->thin = (int)in.thin, p->min_distance = HUGE_VAL;
+    p->active_known = p->swept = p->failed = 0;
+    // Queries and friction speak of a step that this state has not seen: they wait for the next.
+    p->h = 0, p->frictions = p->touches = 0, p->f_pattern++;
     return sizeof s;
 }
 
@@ -4352,13 +4607,15 @@ static void tss__ipc_free(tss_ipc *p, const tss_host *host) {
     tss__ipc_array *all[] = {&p->kinematic, &p->self_off, &p->body_of,      &p->node,
                              &p->node_old,  &p->x_active, &p->distance,     &p->close, &p->close_old,
                              &p->work,      &p->f_node,   &p->f_data,       &p->f_key,
-                             &p->x_start,   &p->touch,    &p->active.plane, &p->kept.plane};
+                             &p->x_start,   &p->touch,    &p->active.plane, &p->kept.plane,
+                             &p->fixed_node, &p->fixed_body, &p->fixed_off};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) tss__ipc_drop(host, all[i]);
     for (int k = 0; k < 4; k++) {
         tss__broad_pairs_free(host, &p->active.pair[k]);
         tss__broad_pairs_free(host, &p->kept.pair[k]);
     }
     tss__broad_free(&p->broad);
+    tss__broad_free(&p->fixed);
     tss_free(host, p->plane, (size_t)p->def.planes * sizeof *p->plane);
     tss_free(host, p->body, (size_t)p->def.bodies * sizeof *p->body);
     tss_free(host, p->pair, (size_t)p->def.pairs * sizeof *p->pair);
@@ -4374,7 +4631,8 @@ static void tss__ipc_destroy(void *user, const tss_host *host) {
 // >>contact_doctor (private)
 // Intersections at x by a sweep along one axis over edges against triangles (3D) or edges against
 // edges (2D). Decided in floating point: a pair that only touches, within rounding, is let pass.
-// Cost: n log n and the overlaps along the axis; for tss_world_check only.
+// Cost: n log n and the overlaps along the axis; for tss_world_check and the starts of steps that
+// may intersect: then n, and the rest only near the nodes that were set free (ctx->fresh).
 // ---------------------------------------------------------------------------------------------
 
 // Side of the plane through a, b, c on which d lies: ±1, or 0 within the rounding of the volume
@@ -4418,17 +4676,55 @@ static int tss__ipc_span_order(const void *a, const void *b) {
     return s->id < t->id ? -1 : s->id > t->id;
 }
 
-static void tss__ipc_spans(const tss_ctx *c, const double *x, int axis, int count, int arity,
-                           const int *node, tss__ipc_span *out) {
-    for (int i = 0; i < count; i++) {
-        out[i].lo = HUGE_VAL, out[i].hi = -HUGE_VAL, out[i].id = i;
-        for (int k = 0; k < arity; k++) {
-            double v = x[(size_t)node[i * arity + k] * (size_t)c->dim + (size_t)axis];
-            if (v < out[i].lo) out[i].lo = v;
-            if (v > out[i].hi) out[i].hi = v;
+static int tss__ipc_is_fresh(const tss_ctx *c, const int *v, int arity) {
+    int fresh = !c->fresh;
+    for (int k = 0; !fresh && k < arity; k++) fresh = c->fresh[v[k]];
+    return fresh;
+}
+
+// Grows box (lower, upper) to hold a primitive.
+static void tss__ipc_grow(const tss_ctx *c, const double *x, const int *v, int arity,
+                          double box[6]) {
+    for (int k = 0; k < arity; k++)
+        for (int a = 0; a < c->dim; a++) {
+            double s = x[(size_t)v[k] * (size_t)c->dim + (size_t)a];
+            if (s < box[a]) box[a] = s;
+            if (s > box[3 + a]) box[3 + a] = s;
         }
+}
+
+static void tss__ipc_empty(double box[6]) {
+    for (int a = 0; a < 3; a++) box[a] = HUGE_VAL, box[3 + a] = -HUGE_VAL;
+}
+
+// Box of the primitives with a fresh node.
+static void tss__ipc_fresh_box(const tss_ipc *p, const tss_ctx *c, const double *x, double box[6]) {
+    const tss_surface *s = &p->surface;
+    tss__ipc_empty(box);
+    for (int i = 0; i < s->edges; i++)
+        if (tss__ipc_is_fresh(c, s->edge + 2 * i, 2)) tss__ipc_grow(c, x, s->edge + 2 * i, 2, box);
+    for (int i = 0; i < s->triangles; i++) {
+        const int *v = s->triangle + 3 * i;
+        if (tss__ipc_is_fresh(c, v, 3)) tss__ipc_grow(c, x, v, 3, box);
     }
-    qsort(out, (size_t)count, sizeof *out, tss__ipc_span_order);
+}
+
+// Extents along x of the primitives whose boxes meet `box`, sorted; returns their number.
+static int tss__ipc_spans(const tss_ctx *c, const double *x, const double box[6], int count,
+                          int arity, const int *node, tss__ipc_span *out) {
+    int kept = 0;
+    for (int i = 0; i < count; i++) {
+        double own[6];
+        int meets = 1;
+        tss__ipc_empty(own);
+        tss__ipc_grow(c, x, node + i * arity, arity, own);
+        for (int a = 0; a < c->dim; a++)
+            meets = meets && own[a] <= box[3 + a] && own[3 + a] >= box[a];
+        out[kept].lo = own[0], out[kept].hi = own[3], out[kept].id = i;
+        kept += meets;
+    }
+    qsort(out, (size_t)kept, sizeof *out, tss__ipc_span_order);
+    return kept;
 }
 
 static int tss__ipc_may_meet(const tss_ipc *p, const tss_ctx *c, const int *e, const int *f,
@@ -4441,6 +4737,7 @@ static int tss__ipc_may_meet(const tss_ipc *p, const tss_ctx *c, const int *e, c
         all = all && fixed[f[k]];
     }
     int a = c->body[e[0]], b = c->body[f[0]];
+    if (!tss__ipc_is_fresh(c, e, 2) && !tss__ipc_is_fresh(c, f, arity)) return 0;
     const tss_ipc_pair *q = tss__ipc_pair_of(p, a, b);
     return !all && !(a == b && self_off[a]) && !(q && q->exclude);
 }
@@ -4454,14 +4751,15 @@ static int tss__ipc_intersections(tss_ipc *p, const tss_ctx *c, const double *x,
     tss__ipc_array memory = {NULL, 0};
     tss__ipc_span *e =
         (tss__ipc_span *)tss__ipc_fit(p->host, &memory, (size_t)(s->edges + count) * sizeof *e);
-    double widest = 0;
+    double widest = 0, box[6];
     if (!e) return -1;
     tss__ipc_span *f = e + s->edges;
-    tss__ipc_spans(c, x, 0, s->edges, 2, s->edge, e);
-    tss__ipc_spans(c, x, 0, count, arity, other, f);
+    tss__ipc_fresh_box(p, c, x, box);
+    int edges = tss__ipc_spans(c, x, box, s->edges, 2, s->edge, e);
+    count = tss__ipc_spans(c, x, box, count, arity, other, f);
     for (int i = 0; i < count; i++)
         widest = f[i].hi - f[i].lo > widest ? f[i].hi - f[i].lo : widest;
-    for (int i = 0; i < s->edges; i++) {
+    for (int i = 0; i < edges; i++) {
         const int *v = s->edge + 2 * e[i].id;
         while (first < count && f[first].lo < e[i].lo - widest) first++;
         for (int k = first; k < count && f[k].lo <= e[i].hi; k++) {
@@ -4566,8 +4864,6 @@ tss_ipc_def tss_ipc_def_default(void) {
     return d;
 }
 
-static int tss__ipc_not_negative(double v) { return v >= 0 && v < HUGE_VAL; }
-
 // What is wrong with a def, or NULL.
 static const char *tss__ipc_def_fault(const tss_ipc_def *d, int dim) {
     if (d->cookie != TSS__IPC_COOKIE) return "start from tss_ipc_def_default()";
@@ -4609,7 +4905,7 @@ static tss_result tss__ipc_create(tss_world *w, const tss_ipc_def *d, int dim, t
     memset(p, 0, sizeof *p);
     p->world = w, p->host = host, p->def = *d, p->min_distance = HUGE_VAL;
     p->dhat_from = "", p->current = &p->active;
-    tss__broad_init(&p->broad, host);
+    tss__broad_init(&p->broad, host), tss__broad_init(&p->fixed, host);
     int ok = tss__ipc_copy(host, (void **)&p->plane, d->plane, d->planes, sizeof *d->plane) &&
              tss__ipc_copy(host, (void **)&p->body, d->body, d->bodies, sizeof *d->body) &&
              tss__ipc_copy(host, (void **)&p->pair, d->pair, d->pairs, sizeof *d->pair);
@@ -4662,7 +4958,7 @@ tss_result tss_ipc_add(tss_world *w, const tss_ipc_def *def, tss_ipc **out) {
     if (fault) return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "contact: %s", fault);
     tss_ipc *p;
     tss_result r = tss__ipc_create(w, def, dim, &p);
-    if (r != TSS_OK) return r;
+    if (r != TSS_OK) return tss_world_fail(w, r, "contact: %s", tss_result_text(r));
     const tss_host *host = p->host;
     tss_energy_def e = tss__ipc_barrier_def(p, dim);
     p->barrier = p->friction = -1;
@@ -4695,12 +4991,13 @@ static size_t tss__ipc_bytes(const tss_ipc *p) {
     const tss__ipc_array *all[] = {&p->kinematic, &p->self_off, &p->body_of,      &p->node,
                                    &p->node_old,  &p->x_active, &p->distance,     &p->close, &p->close_old,
                                    &p->work,      &p->f_node,   &p->f_data,       &p->f_key,
-                                   &p->x_start,   &p->touch,    &p->active.plane, &p->kept.plane};
+                                   &p->x_start,   &p->touch,    &p->active.plane, &p->kept.plane,
+                                   &p->fixed_node, &p->fixed_body, &p->fixed_off};
     size_t sum = sizeof *p;
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) sum += all[i]->bytes;
     for (int k = 0; k < 4; k++)
-        sum += (size_t)(p->active.pair[k].room + p->kept.pair[k].room + p->broad.list[k].room) *
-               sizeof(tss__pair);
+        sum += (size_t)(p->active.pair[k].room + p->kept.pair[k].room + p->broad.list[k].room +
+                        p->fixed.list[k].room) * sizeof(tss__pair);
     return sum;
 }
 
@@ -4716,6 +5013,11 @@ void tss_ipc_get_info(const tss_ipc *p, tss_ipc_info *out) {
     out->shortened = p->shortened, out->doubled = p->doubled, out->bytes = tss__ipc_bytes(p);
 }
 
+// The result of a query, said to the world if it is an error.
+static tss_result tss__ipc_say(tss_ipc *p, tss_result r) {
+    return r == TSS_OK ? r : tss_world_fail(p->world, r, "contact: %s", tss_result_text(r));
+}
+
 // What the queries need of the world at its current state.
 static tss_result tss__ipc_query(tss_ipc *p, tss_ctx *c) {
     memset(c, 0, sizeof *c);
@@ -4723,11 +5025,12 @@ static tss_result tss__ipc_query(tss_ipc *p, tss_ctx *c) {
     c->X = tss_world_rest(p->world), c->kind = tss_world_kinds(p->world);
     c->body = (const int *)p->body_of.p, c->h = p->h, c->ah2 = p->ah2;
     c->x_t = (const double *)p->x_start.p;
-    if (!(p->dhat > 0) || !(p->h > 0)) return TSS_ERROR_NOT_PREPARED;
+    if (!(p->dhat > 0) || !(p->h > 0)) return tss__ipc_say(p, TSS_ERROR_NOT_PREPARED);
     tss_surface s;
     tss_result r = tss_world_surface(p->world, &s);
-    if (r != TSS_OK || s.topology != p->surface.topology) return TSS_ERROR_NOT_PREPARED;
-    return tss__ipc_find_active(p, c, tss_world_positions(p->world), 0);
+    if (r != TSS_OK || s.topology != p->surface.topology || p->broad.mesh.nodes != c->nodes)
+        return tss__ipc_say(p, TSS_ERROR_NOT_PREPARED);
+    return tss__ipc_say(p, tss__ipc_find_active(p, c, tss_world_positions(p->world), 0));
 }
 
 // Friction stencil of active stencil id, looked for from *at on (both lists ascend); −1: none.
@@ -4782,7 +5085,7 @@ tss_result tss_ipc_forces(tss_ipc *p, double *out) {
     tss_ctx c;
     tss_stencils s;
     tss_result r = tss__ipc_query(p, &c);
-    if (r == TSS_OK) r = tss__ipc_hand_out(p, &c, &p->active, &s);
+    if (r == TSS_OK) r = tss__ipc_say(p, tss__ipc_hand_out(p, &c, &p->active, &s));
     if (r != TSS_OK) return r;
     const double *x = tss_world_positions(p->world);
     int arity = tss__ipc_arity(c.dim);
@@ -4815,14 +5118,14 @@ tss_result tss_ipc_pressures(tss_ipc *p, double *out) {
     tss_ctx c;
     tss_stencils s;
     tss_result r = tss__ipc_query(p, &c);
-    if (r == TSS_OK) r = tss__ipc_hand_out(p, &c, &p->active, &s);
+    if (r == TSS_OK) r = tss__ipc_say(p, tss__ipc_hand_out(p, &c, &p->active, &s));
     if (r != TSS_OK) return r;
     const double *x = tss_world_positions(p->world);
     int dim = c.dim, items = dim == 3 ? p->surface.triangles : p->surface.edges;
     const int *item = dim == 3 ? p->surface.triangle : p->surface.edge;
     size_t n = (size_t)c.nodes, need = n * (size_t)dim * sizeof(double);
     double *g = (double *)tss__ipc_fit(p->host, &p->work, need);
-    if (!g) return TSS_ERROR_NO_MEMORY;
+    if (!g) return tss__ipc_say(p, TSS_ERROR_NO_MEMORY);
     memset(g, 0, need);
     memset(out, 0, n * sizeof *out);
     tss__ipc_sum_gradient(p, &c, x, p->kappa, g);
@@ -4863,12 +5166,13 @@ tss_result tss_ipc_touches(tss_ipc *p, int max, tss_ipc_touch *out, int *count) 
     int n = 0;
     *count = 0;
     tss_result r = tss__ipc_query(p, &c);
-    if (r == TSS_OK) r = tss__ipc_gather_touches(p, &c, tss_world_positions(p->world), &now, &n);
+    if (r == TSS_OK)
+        r = tss__ipc_gather_touches(p, &c, tss_world_positions(p->world), &now, &n);
     if (r == TSS_OK)
         *count = tss__ipc_merge_touches((const tss__ipc_touch_key *)p->touch.p, p->touches,
                                         (const tss__ipc_touch_key *)now.p, n, max, out);
     tss__ipc_drop(p->host, &now);
-    return r;
+    return tss__ipc_say(p, r);
 }
 
 #ifdef __cplusplus

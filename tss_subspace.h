@@ -2376,6 +2376,7 @@ typedef struct tss__sub_block {  // a candidate of the oracle
     int active, age;             // age: steps since it was activated or last useful
     int initial;
     double error, progress;      // 𝒢_s, ℰ_s
+    double last;                 // 𝒢_s of the iterate before, as measured
 } tss__sub_block;
 
 typedef struct tss__modal {  // a body with modes
@@ -4757,10 +4758,11 @@ static tss_result tss__sub_solve_enriched(tss_subspace *s, const tss_unknowns *u
 // taken away, within a step. R is evaluated where F and ℰ pass, so that most iterates need none.
 // ---------------------------------------------------------------------------------------------
 
-// Error of a block relative to 𝒢 of nodes, such that 0.5 adds as many modes as Table 1 of the paper
-// has: rubber jello 72 → 84, soft 120, stiff 72, roller 72. At 0.2 the soft one takes 204, at 0.05
-// none takes any. Mesh-independent within a factor of 1.6.
-#define TSS__SUB_MODE_ERROR 0.1
+// Error of a block relative to 𝒢 of nodes, such that 0.5 adds about as many modes as Table 1 of the
+// paper has (jello: rubber 72 → 84, soft 120; roller 72). A block's error counts only as far as it
+// persists over two iterates: the first one after the step filter let a contact in carries a barrier
+// force that grows with 1/mesh width and is gone in the next.
+#define TSS__SUB_MODE_ERROR 0.3
 
 typedef struct tss__sub_near {  // what R needs: the gradient of all stencils around one node
     double g[TSS_BATCH * TSS__SUB_STENCIL];
@@ -4977,6 +4979,10 @@ static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, i
         double e = mass[i] / all * tss__sub_norm(v, d) / (ah2 * scale);
         q->error = e > q->error ? e : q->error;
     }
+    if (s->query) return TSS_OK;
+    double now = q->error, last = it->number == 0 ? 0 : q->last;
+    if (!literal && last < now) q->error = last;
+    q->last = now;
     return TSS_OK;
 }
 

@@ -214,7 +214,7 @@ static void run(tss__broad *b, const tss__broad_mesh *bm, const mesh *m, const d
     for (int i = 0; i < 2; i++) {
         double before = *step;
         int c;
-        *step = tss__broad_step(b, i, &b->list[i], m->x, d, 0.1, before, &c);
+        *step = tss__broad_step(b, i, &b->list[i], m->x, d, 0.1, 0, before, &c);
         if (*step < before) culprit[0] = i, culprit[1] = c;
     }
     t->step = least(t->step, now() - s), s = now();

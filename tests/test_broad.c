@@ -774,7 +774,7 @@ static void test_step(void **state) {
         for (int kind = 0; kind < TSS__BROAD_KINDS; kind++) {
             int culprit = 7;
             const tss__broad_pairs *in = &b.list[kind];
-            double t = tss__broad_step(&b, kind, in, s.x, s.d, slack, 1, &culprit);
+            double t = tss__broad_step(&b, kind, in, s.x, s.d, slack, 0, 1, &culprit);
             assert_true(t >= 0 && t <= 1 && culprit < in->count && (culprit >= 0) == (t < 1));
             for (int i = 0; i < in->count; i++) {
                 long double d0 = ref_distance(&s, kind, in->pair[i], 0);
@@ -793,6 +793,75 @@ static void test_step(void **state) {
         scene_free(&s);
     }
     assert_true(limited > 50 && whole > 50);
+    tss__broad_free(&b);
+}
+
+// A least distance: no pair comes below it (by sampling), pairs already below only part, and a pair above
+// it that is not asked to come nearer is not held.
+static void test_step_least(void **state) {
+    (void)state;
+    tss_host host = tss_host_default();
+    static tss__broad b;
+    int edge[4] = {0, 1, 2, 3}, tri[3] = {1, 2, 3}, point[1] = {0}, one[2] = {1, 2}, held = 0, parted = 0;
+    seed = 77;
+    tss__broad_init(&b, &host);
+    for (int i = 0; i < 20000; i++) {
+        int kind = i % 3, who;
+        double x[12], d[12], least = i % 5 ? uniform(0, .05) : 0;
+        for (int k = 0; k < 12; k++) x[k] = uniform(-1, 1), d[k] = uniform(-1, 1);
+        tss__broad_mesh m = {3, 4, 1, kind == TSS__BROAD_PE ? 1 : 2, 1, point, kind == TSS__BROAD_PE ? one : edge, tri,
+                             NULL, NULL, NULL};
+        b.mesh = m;
+        tss__pair p = {0, kind == TSS__BROAD_EE};
+        tss__broad_pairs in = {&p, 1, 1};
+        double d0 = sqrt(tss_ipc_distance((tss_ipc_kind)kind, 3, x, NULL));
+        if (i % 7 == 0) least = 2 * d0;
+        double t = tss__broad_step(&b, kind, &in, x, d, 0.2, least, 1, &who);
+        double floor = fmax(.2 * d0, fmin(least, d0));
+        held += t < 1, parted += t > 0 && least > d0;
+        for (int k = 0; k <= 32; k++) {
+            double y[12];
+            for (int q = 0; q < 12; q++) y[q] = x[q] + t * k / 32 * d[q];
+            assert_true(sqrt(tss_ipc_distance((tss_ipc_kind)kind, 3, y, NULL)) >= floor * (1 - 1e-6));
+        }
+    }
+    assert_true(held > 2000 && held < 18000 && parted > 200);
+    tss__broad_free(&b);
+}
+
+// The lanes on the pairs that are hard for them: ends far away, at small distances, moving apart.
+static void test_step_apart(void **state) {
+    (void)state;
+    tss_host host = tss_host_default();
+    static tss__broad b;
+    int edge[4] = {0, 1, 2, 3}, tri[3] = {1, 2, 3}, point[1] = {0}, one[2] = {1, 2}, stuck = 0, cases = 0;
+    seed = 78;
+    tss__broad_init(&b, &host);
+    for (int i = 0; i < 12000; i++) {
+        int kind = i % 3, who, border = i / 3 % 2;
+        double c = cos(uniform(0, 6)), s = sin(uniform(0, 6)), x[12], d[12] = {0}, dist = pow(10, uniform(-11, -6));
+        double l = sqrt(c * c + s * s + 1), n[3] = {c / l, s / l, 1 / l}, u[3], v[3], un = 0, vn = 0;
+        for (int a = 0; a < 3; a++) u[a] = uniform(-1, 1), v[a] = uniform(-1, 1);
+        for (int a = 0; a < 3; a++) un += u[a] * n[a], vn += v[a] * n[a];
+        for (int a = 0; a < 3; a++) u[a] -= un * n[a], v[a] -= vn * n[a];
+        for (int a = 0; a < 3; a++) {
+            x[a] = dist * n[a], d[a] = n[a];
+            x[3 + a] = -.3 * u[a] - (border ? 0 : .3) * v[a], x[6 + a] = .7 * u[a] - (border ? 0 : .3) * v[a];
+            x[9 + a] = border ? .2 * u[a] + v[a] : -.3 * u[a] + .7 * v[a];
+            if (kind != TSS__BROAD_EE) continue;
+            x[a] -= .4 * u[a], x[3 + a] = dist * n[a] + .6 * u[a], d[3 + a] = n[a];
+            x[6 + a] = -.3 * v[a], x[9 + a] = .7 * v[a];
+        }
+        tss__broad_mesh m = {3, 4, 1, kind == TSS__BROAD_PE ? 1 : 2, 1, point, kind == TSS__BROAD_PE ? one : edge, tri,
+                             NULL, NULL, NULL};
+        b.mesh = m;
+        tss__pair p = {0, kind == TSS__BROAD_EE};
+        tss__broad_pairs in = {&p, 1, 1};
+        if (!(tss_ipc_distance((tss_ipc_kind)kind, 3, x, NULL) > 0.01 * dist * dist)) continue;
+        cases++, stuck += tss__broad_step(&b, kind, &in, x, d, 0.2, 0, 1, &who) == 0;
+    }
+    print_message("    %d of %d held\n", stuck, cases);
+    assert_true(cases > 10000 && stuck < cases / 200);
     tss__broad_free(&b);
 }
 
@@ -885,6 +954,7 @@ int main(void) {
         cmocka_unit_test(test_same_bits),     cmocka_unit_test(test_no_memory),
         cmocka_unit_test(test_no_growth),     cmocka_unit_test(test_near),
         cmocka_unit_test(test_reach),         cmocka_unit_test(test_step),
+        cmocka_unit_test(test_step_least),    cmocka_unit_test(test_step_apart),
         cmocka_unit_test(test_large),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -706,6 +706,86 @@ static void test_ccd_extremes(void **unused) {
     assert_true(tss_ipc_ccd(s.kind, 3, s.x, d, 0.1, 1, 0, NULL) == 0);
 }
 
+// Primitives of size 1 at a small distance that move straight apart are free to go: a direction with the
+// rounding of their far ends in it would not separate them. Of the random ones some are flat or thin.
+static void test_ccd_near_and_apart(void **unused) {
+    (void)unused;
+    reseed(13);
+    int stuck = 0, cases = 0;
+    for (int i = 0; i < 12000; i++) {
+        tss_ipc_kind kind = (tss_ipc_kind)(i % 3);
+        double n[3], u[3], v[3], x[12], d[12] = {0}, dist = pow(10, uniform(-11, -6)), l = 0, un = 0, vn = 0;
+        for (int a = 0; a < 3; a++) n[a] = uniform(-1, 1), u[a] = uniform(-1, 1), v[a] = uniform(-1, 1);
+        for (int a = 0; a < 3; a++) l += n[a] * n[a];
+        for (int a = 0; a < 3; a++) n[a] /= sqrt(l);
+        for (int a = 0; a < 3; a++) un += u[a] * n[a], vn += v[a] * n[a];
+        for (int a = 0; a < 3; a++) u[a] -= un * n[a], v[a] -= vn * n[a];
+        int border = i / 3 % 2;  // over the inside, or over the border of a triangle
+        for (int a = 0; a < 3; a++) {
+            x[a] = dist * n[a], d[a] = n[a];
+            if (kind == TSS_IPC_EDGE_EDGE) {
+                x[a] -= .4 * u[a], x[3 + a] = dist * n[a] + .6 * u[a], d[3 + a] = n[a];
+                x[6 + a] = -.3 * v[a], x[9 + a] = .7 * v[a];
+            } else {
+                x[3 + a] = -.3 * u[a] - (border ? 0 : .3) * v[a], x[6 + a] = .7 * u[a] - (border ? 0 : .3) * v[a];
+                x[9 + a] = border ? .2 * u[a] + v[a] : -.3 * u[a] + .7 * v[a];
+            }
+        }
+        if (!(tss_ipc_distance(kind, 3, x, NULL) > 0.01 * dist * dist)) continue;
+        cases++, stuck += tss_ipc_ccd(kind, 3, x, d, 0.2, 1, 0, NULL) == 0;
+    }
+    print_message("    %d of %d held\n", stuck, cases);
+    assert_true(cases > 10000 && stuck < cases / 200);
+}
+
+// Random pairs of all sizes, and parallel, flat, coplanar, zero-length and close ones: never nearer than
+// the slack allows, by the distance at sampled times.
+static void ccd_hard_case(int i, double *x, double *d, double *size) {
+    tss_ipc_kind kind = (tss_ipc_kind)(i % 3);
+    *size = pow(10, 4 * uniform(-1, 1));
+    for (int k = 0; k < 12; k++) x[k] = uniform(-1, 1), d[k] = uniform(-1, 1) * pow(10, 2 * uniform(-1, 1));
+    double q = uniform(-2, 2), thin = 1e-4 * pow(10, uniform(-9, 3)), near = pow(10, uniform(-8, 0)), coef[4], r[3] = {0};
+    int form = i / 3 % 8;
+    for (int a = 0; a < 3; a++) {
+        if (form == 1) x[9 + a] = x[6 + a] + (x[3 + a] - x[a]) * q;
+        if (form == 2) x[9 + a] = x[6 + a] + (x[3 + a] - x[a]) + thin * uniform(-1, 1);
+        if (form == 4) x[3 + a] = x[a];
+        if (form == 5) x[9 + a] = .5 * (x[3 + a] + x[6 + a]);
+    }
+    for (int k = 0; k < 4 && form == 3; k++) x[3 * k + 2] = .5;
+    if (form == 6) {
+        tss_ipc_distance(kind, 3, x, coef);
+        for (int k = 0; k < tss_ipc_pair_nodes(kind); k++)
+            for (int a = 0; a < 3; a++) r[a] += coef[k] * x[3 * k + a];
+        for (int a = 0; a < 3; a++) {
+            x[a] -= r[a] * (1 - near);
+            if (kind == TSS_IPC_EDGE_EDGE) x[3 + a] -= r[a] * (1 - near);
+        }
+    }
+    for (int k = 0; k < 12; k++) x[k] *= *size, d[k] *= *size;
+}
+
+static void test_ccd_hard_cases(void **unused) {
+    (void)unused;
+    reseed(14);
+    int free_ways = 0;
+    for (int i = 0; i < 60000; i++) {
+        tss_ipc_kind kind = (tss_ipc_kind)(i % 3);
+        double x[12], d[12], y[12], size;
+        ccd_hard_case(i, x, d, &size);
+        double t = tss_ipc_ccd(kind, 3, x, d, .2, 1, 0, NULL), d0 = sqrt(tss_ipc_distance(kind, 3, x, NULL));
+        if (!(d0 > 1e-9 * size)) continue;
+        assert_true(t > 0);
+        free_ways += t == 1;
+        for (int k = 1; k <= 20; k++) {
+            double at = k == 20 ? t : t * k / 20;
+            for (int j = 0; j < 12; j++) y[j] = x[j] + at * d[j];
+            assert_true(sqrt(tss_ipc_distance(kind, 3, y, NULL)) >= .2 * (1 - 1e-6) * d0);
+        }
+    }
+    assert_true(free_ways > 1000 && free_ways < 50000);
+}
+
 // The iteration cap returns the time reached, which is safe: below what more iterations give.
 static void test_ccd_cap(void **unused) {
     (void)unused;
@@ -763,6 +843,8 @@ int main(void) {
         cmocka_unit_test(test_ccd_known_hits),
         cmocka_unit_test(test_ccd_against_sampling),
         cmocka_unit_test(test_ccd_extremes),
+        cmocka_unit_test(test_ccd_near_and_apart),
+        cmocka_unit_test(test_ccd_hard_cases),
         cmocka_unit_test(test_ccd_cap),
         cmocka_unit_test(test_ccd_plane),
     };
