@@ -4075,7 +4075,7 @@ static tss_result tss__sub_build_H(tss_subspace *s, const tss_unknowns *u, const
         size_t aa = (size_t)m->a * (size_t)m->a;
         if (m->a == 0) continue;
         if (ctx->quasistatic) memset(H + m->hat, 0, aa * sizeof(double));
-        else memcpy(H + m->hat, mask ? m->thin_gram.p : m->gram.p, aa * sizeof(double));
+        else memcpy(H + m->hat, m->thin_gram.p, aa * sizeof(double));  // enriched nodes' inertia is in A
         tss__sub_sum sum = {s, k, (double *)tss__sub_need(s, &m->sum, aa, sizeof(double))};
         if (!sum.H) return tss__sub_no_memory(s);
         if (m->sum_stale) tss_parallel(&s->host, m->a, tss__sub_sum_task, &sum);
@@ -4279,7 +4279,8 @@ static tss_result tss__sub_modal_apply(tss_subspace *s, int mask, const double *
                 y[m->tilde + j] = r[m->at + (size_t)tss__sub_kept(m, mask)[j]];
         }
         if (l->width > TSS__SUB_DENSE) {
-            if (tss_chol_solve(s->chol_q, y, 1) != TSS_OK) return TSS_ERROR_SINGULAR;
+            tss_result r2 = tss_chol_solve(s->chol_q, y, 1);
+            if (r2 != TSS_OK) return tss_world_fail(s->w, r2, "subspace: H_q: %s", tss_result_text(r2));
         } else if (l->width > 0)
             tss_dense_chol_solve(l->width, tss__sub_f(&s->factors) + l->factor, l->width, y, l->width, 1);
         for (int k = lead; k < s->modal_count; k++) {
@@ -4650,8 +4651,9 @@ static tss_result tss__sub_direct(tss_subspace *s, const double *rx, const doubl
     memcpy(dx, rx, nx * sizeof(double));
     tss__sub_J_columns(s, width, X);
     memcpy(Y, X, nx * w * sizeof(double));
-    if (tss_chol_solve(s->chol_x, dx, 1) != TSS_OK || tss_chol_solve(s->chol_x, Y, width) != TSS_OK)
-        return TSS_ERROR_SINGULAR;
+    r = tss_chol_solve(s->chol_x, dx, 1);
+    if (r == TSS_OK) r = tss_chol_solve(s->chol_x, Y, width);
+    if (r != TSS_OK) return tss_world_fail(s->w, r, "subspace: H_x: %s", tss_result_text(r));
     tss_dense_product(1, 0, width, width, (int)nx, -1, X, (int)nx, Y, (int)nx, 1, S, width);
     int shifted = 0;
     if (width > 0 && (r = tss__sub_factor_dense(s, width, S, &shifted)) != TSS_OK) return r;
@@ -4955,18 +4957,19 @@ static tss_result tss__sub_block_rows(tss_subspace *s, int body, const tss__sub_
 static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
     const tss__modal *m = tss__sub_modal(s, body);
     const int d = s->dim, vector = tss__sub_base(s, q->basis)->b.vector, literal = s->def.oracle == TSS_ORACLE_LITERAL;
-    double *U, sum[3 * 64], ah2 = tss__sub_ah2(s, it->ctx), all = 0;
-    int f;
+    double *U, ah2 = tss__sub_ah2(s, it->ctx), all = 0;
+    int f = 0;
     tss_result r = tss__sub_block_rows(s, body, q, &U, &f);
-    if (r != TSS_OK || f > 64) return r;
+    double *sum = (double *)tss__sub_need(s, &s->small_work, (size_t)(3 * f), sizeof(double));
+    if (r != TSS_OK || !sum) return r != TSS_OK ? r : tss__sub_no_memory(s);
     const double *mass = tss_world_masses(s->w) + m->first, *g = it->g + m->first * d;
-    memset(sum, 0, sizeof sum);
+    memset(sum, 0, (size_t)(3 * f) * sizeof(double));
     for (int i = 0; i < m->nodes; i++) {
         if (tss__sub_i(&s->body_of)[m->first + i] != body) continue;
         all += mass[i];
         for (int p = 0; p < d; p++)
             for (int k = 0; k < f; k++)
-                sum[vector ? k : p * 64 + k] += U[vector ? (i * d + p) * f + k : i * f + k] * g[i * d + p];
+                sum[vector ? k : p * f + k] += U[vector ? (i * d + p) * f + k : i * f + k] * g[i * d + p];
     }
     q->error = 0;
     for (int i = 0; i < m->nodes; i++) {
@@ -4974,7 +4977,7 @@ static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, i
         if (tss__sub_i(&s->body_of)[m->first + i] != body || !(eta > 0)) continue;
         for (int p = 0; p < d; p++)
             for (int k = 0; k < f; k++)
-                v[p] += U[vector ? (i * d + p) * f + k : i * f + k] * sum[vector ? k : p * 64 + k];
+                v[p] += U[vector ? (i * d + p) * f + k : i * f + k] * sum[vector ? k : p * f + k];
         double scale = literal ? tss__sub_f(&s->gamma_print)[m->first + i] : eta / m->diagonal / TSS__SUB_MODE_ERROR;
         double e = mass[i] / all * tss__sub_norm(v, d) / (ah2 * scale);
         q->error = e > q->error ? e : q->error;
@@ -4991,12 +4994,13 @@ static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, i
 static tss_result tss__sub_block_progress(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
     const tss__modal *m = tss__sub_modal(s, body);
     const int d = tss__sub_base(s, q->basis)->b.vector ? s->dim : 1, literal = s->def.oracle == TSS_ORACLE_LITERAL;
-    double *U, c[64], ah2 = tss__sub_ah2(s, it->ctx), all = 0, sum = 0, total = 0;
-    int f;
+    double *U, ah2 = tss__sub_ah2(s, it->ctx), all = 0, sum = 0, total = 0;
+    int f = 0;
     tss_result r = tss__sub_block_rows(s, body, q, &U, &f);
-    if (r != TSS_OK || f > 64) return r;
+    double *c = (double *)tss__sub_need(s, &s->small_work, (size_t)f, sizeof(double));
+    if (r != TSS_OK || !c) return r != TSS_OK ? r : tss__sub_no_memory(s);
     const double *mass = tss_world_masses(s->w) + m->first;
-    memset(c, 0, sizeof c);
+    memset(c, 0, (size_t)f * sizeof(double));
     for (int i = 0; i < m->nodes; i++) {
         if (tss__sub_i(&s->body_of)[m->first + i] != body) continue;
         all += mass[i];
@@ -5455,6 +5459,10 @@ static size_t tss__sub_load(tss_subspace *s, const tss__sub_head *h, const char 
     if (!pending) return 0;
     if (on > 0) memcpy(pending, at, on + ages);
     s->pending_n = (int)on, s->pending_groups = (int)(ages / sizeof(int));
+    for (int i = 0; s->built && i < s->n; i++)  // saved before there were groups: nothing was enriched
+        if (tss__sub_i(&s->group)[i] >= 0) tss__sub_u(&s->on)[i] = 0;
+    for (int g = 0; s->built && g < s->groups; g++) tss__sub_i(&s->group_age)[g] = 0;
+    s->x_stamp++;
     at += on + ages;
     for (int k = 0; k < s->modal_count; k++) {
         tss__modal *m = tss__sub_modal(s, k);
@@ -5589,6 +5597,8 @@ tss_result tss_subspace_add(tss_world *w, const tss_subspace_def *def, tss_subsp
     if (!w || !def) return TSS_ERROR_BAD_ARGUMENT;
     tss_result r = tss__sub_def_ok(w, def);
     if (r != TSS_OK) return r;
+    if (tss_subspace_of(w))
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "subspace: this world has one; tss_subspace_set changes it");
     tss_subspace *s = (tss_subspace *)tss_alloc(tss_world_host(w), sizeof *s);
     if (!s) return tss_world_fail(w, TSS_ERROR_NO_MEMORY, "subspace: out of memory");
     memset(s, 0, sizeof *s);
@@ -5609,6 +5619,7 @@ tss_result tss_subspace_set(tss_subspace *s, const tss_subspace_def *def) {
     if (r != TSS_OK) return r;
     int partitions = s->def.partitions, modes_change = def->mode != s->def.mode;
     s->def = *def, s->def.partitions = partitions;
+    if (modes_change) s->pending_n = 0;
     for (int k = 0; modes_change && k < s->modal_count; k++) tss__sub_modal(s, k)->stale = 1;
     if (!modes_change || !s->built) return TSS_OK;
     for (int i = 0; i < s->n; i++)  // subspace alone: no nodes; others find what they need
@@ -5793,15 +5804,18 @@ tss_result tss_basis_mode(const tss_world *w, tss_basis id, int mode, double *ou
     int block = 0, f = b->vector ? mode : mode / s->dim;
     while (b->first[block + 1] <= f) block++;
     memset(out, 0, (size_t)(m->nodes * s->dim) * sizeof(double));
+    int wide = b->first[block + 1] - b->first[block];
+    double *row = (double *)tss_alloc(&s->host, (size_t)wide * sizeof(double));
+    if (!row) return TSS_ERROR_NO_MEMORY;
     for (int i = 0; i < m->nodes; i++) {
         if (b->vector) {
             for (int c = 0; c < s->dim; c++) out[i * s->dim + c] = b->value[(i * s->dim + c) * b->columns + f];
             continue;
         }
-        double row[64];
-        tss__basis_rows(b, tss__sub_X(s, m), s->dim, &i, 1, &block, 1, row, 64);
+        tss__basis_rows(b, tss__sub_X(s, m), s->dim, &i, 1, &block, 1, row, wide);
         out[i * s->dim + mode % s->dim] = row[f - b->first[block]];
     }
+    tss_free(&s->host, row, (size_t)wide * sizeof(double));
     return TSS_OK;
 }
 

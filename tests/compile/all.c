@@ -2,5 +2,6 @@
 #define TSS_IMPLEMENTATION
 #include "tss.h"
 #include "tss_ipc.h"
+#include "tss_subspace.h"
 #include "tss_io.h"
 #include "tss_shapes.h"
