@@ -5308,8 +5308,9 @@ static tss_result tss__sub_step_modes(tss_subspace *s, const double *step, doubl
             continue;
         }
         int w = m->wide_rank, *kept = tss__sub_i(&m->wide);
-        double *G = (double *)tss__sub_need(s, &s->small, (size_t)w * (size_t)(w + 1), sizeof(double)), *z = G + w * w;
+        double *G = (double *)tss__sub_need(s, &s->small, (size_t)w * (size_t)(w + 1), sizeof(double));
         if (!G) return tss__sub_no_memory(s);
+        double *z = G + w * w;
         tss__sub_pick(m, m, 0, tss__sub_f(&m->gram), G, w);
         for (int i = 0; i < w; i++) z[i] = y[kept[i]];
         memset(q, 0, (size_t)m->a * sizeof(double));
@@ -5462,7 +5463,7 @@ static size_t tss__sub_load(tss_subspace *s, const tss__sub_head *h, const char 
     for (int i = 0; s->built && i < s->n; i++)  // saved before there were groups: nothing was enriched
         if (tss__sub_i(&s->group)[i] >= 0) tss__sub_u(&s->on)[i] = 0;
     for (int g = 0; s->built && g < s->groups; g++) tss__sub_i(&s->group_age)[g] = 0;
-    s->x_stamp++;
+    s->topology = ~s->topology, s->x_stamp++;  // node states anew: partly pinned nodes are enriched
     at += on + ages;
     for (int k = 0; k < s->modal_count; k++) {
         tss__modal *m = tss__sub_modal(s, k);
