@@ -5460,10 +5460,13 @@ static size_t tss__sub_load(tss_subspace *s, const tss__sub_head *h, const char 
     if (!pending) return 0;
     if (on > 0) memcpy(pending, at, on + ages);
     s->pending_n = (int)on, s->pending_groups = (int)(ages / sizeof(int));
-    for (int i = 0; s->built && i < s->n; i++)  // saved before there were groups: nothing was enriched
+    int reset = s->built && on == 0;  // saved before there were groups: nothing was enriched
+    for (int i = 0; reset && i < s->n; i++)
         if (tss__sub_i(&s->group)[i] >= 0) tss__sub_u(&s->on)[i] = 0;
-    for (int g = 0; s->built && g < s->groups; g++) tss__sub_i(&s->group_age)[g] = 0;
-    s->topology = ~s->topology, s->x_stamp++;  // node states anew: partly pinned nodes are enriched
+    for (int g = 0; reset && g < s->groups; g++) tss__sub_i(&s->group_age)[g] = 0;
+    if (reset) s->topology = ~s->topology;  // node states anew: partly pinned nodes are enriched
+    if (s->built && on > 0) tss__sub_apply_pending(s);
+    s->x_stamp++;
     at += on + ages;
     for (int k = 0; k < s->modal_count; k++) {
         tss__modal *m = tss__sub_modal(s, k);

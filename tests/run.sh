@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs the tests and ends with `N passed, N failed`.
 #   tests/run.sh BUILD             everything
-#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|unit   one part
+#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|unit   one part
 # Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
 set -u
 export OMP_WAIT_POLICY=passive  # tests may share the machine: threads that wait shall not spin
@@ -159,8 +159,18 @@ scenes() {
     done
 }
 
+# Paper A's figures on small meshes: a line `ok` or `FAILED` a claim.
+figures() {
+    out="$log/figures.log"
+    sh tests/figures.sh "$build" >"$out" 2>&1
+    grep -E '^(ok|FAILED) ' "$out"
+    p=$(grep -c '^ok ' "$out"); f=$(grep -c '^FAILED ' "$out")
+    [ "$((p + f))" -gt 0 ] || { f=1; tail -n 15 "$out"; }
+    passed=$((passed + p)); failed=$((failed + f))
+}
+
 case $part in
-all) unit; checkers; scenes; nodeps; compat; sanitize ;;
+all) unit; checkers; scenes; figures; nodeps; compat; sanitize ;;
 *) $part ;;
 esac
 printf '%d passed, %d failed\n' "$passed" "$failed"
