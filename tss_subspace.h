@@ -2532,6 +2532,10 @@ static tss__sub_basis *tss__sub_base(const tss_subspace *s, int k) { return (tss
 static tss__sub_part *tss__sub_parts(const tss_subspace *s, int k) { return (tss__sub_part *)s->parts.p + k; }
 static tss__sub_block *tss__sub_blocks(const tss__modal *m) { return (tss__sub_block *)m->block.p; }
 
+static double tss__sub_clock(const tss_subspace *s) {
+    return s->host.clock ? s->host.clock(s->host.clock_ctx) : 0;
+}
+
 static tss_result tss__sub_no_memory(const tss_subspace *s) {
     return tss_world_fail(s->w, TSS_ERROR_NO_MEMORY, "subspace: out of memory (%zu bytes in use)", s->bytes);
 }
@@ -3000,17 +3004,17 @@ static tss_result tss__sub_build_parts(tss_subspace *s) {
     return TSS_OK;
 }
 
-// node → stencils of all energies whose lists do not change: pairs (entry, id).
-static tss_result tss__sub_build_near(tss_subspace *s) {
+// node → stencils of the energies whose lists stay (dynamic 0) or change: pairs (entry, id).
+static tss_result tss__sub_build_near(tss_subspace *s, int dynamic, tss__sub_buf *start, tss__sub_buf *list) {
     size_t n = (size_t)s->n;
-    int *ptr = (int *)tss__sub_need(s, &s->near_ptr, n + 1, sizeof(int));
+    int *ptr = (int *)tss__sub_need(s, start, n + 1, sizeof(int));
     if (!ptr) return tss__sub_no_memory(s);
     memset(ptr, 0, (n + 1) * sizeof(int));
     for (int pass = 0; pass < 2; pass++) {
-        int *out = tss__sub_i(&s->near_id);
-        for (int e = 0; e < s->entries; e++) {
+        int *out = tss__sub_i(list);
+        for (int e = 0; e < tss_world_energies(s->w); e++) {
             tss_energy_view v;
-            if (tss_energy_get(s->w, e, &v) != TSS_OK || (v.def->flags & TSS_ENERGY_DYNAMIC)) continue;
+            if (tss_energy_get(s->w, e, &v) != TSS_OK || !!(v.def->flags & TSS_ENERGY_DYNAMIC) != dynamic) continue;
             for (int k = 0; k < v.list.count * v.def->arity; k++) {
                 int node = v.list.node[k];
                 if (node < 0 || tss__sub_i(&s->body_of)[node] < 0) continue;
@@ -3020,7 +3024,7 @@ static tss_result tss__sub_build_near(tss_subspace *s) {
         }
         if (pass == 1) break;
         for (size_t i = 0; i < n; i++) ptr[i + 1] += ptr[i];
-        if (!tss__sub_need(s, &s->near_id, 2 * (size_t)ptr[n], sizeof(int))) return tss__sub_no_memory(s);
+        if (!tss__sub_need(s, list, 2 * (size_t)ptr[n], sizeof(int))) return tss__sub_no_memory(s);
     }
     for (size_t i = n; i > 0; i--) ptr[i] = ptr[i - 1];
     ptr[0] = 0;
@@ -3042,15 +3046,17 @@ static tss_result tss__sub_build(tss_subspace *s, const tss_ctx *c, const tss_un
     uint64_t patterns = tss__sub_patterns(s);
     if (s->built && s->topology == c->topology && s->patterns == patterns) return TSS_OK;
     tss_result r = TSS_OK;
+    double from = tss__sub_clock(s);
     s->ctx_body = c->body, s->entries = tss_world_energies(s->w);
     if (!s->built || s->n != c->nodes) {
         s->n = c->nodes, s->built = 0;
         if ((r = tss__sub_build_groups(s, c)) != TSS_OK) return r;
     }
     tss__sub_node_states(s, u);
-    if ((r = tss__sub_build_parts(s)) == TSS_OK) r = tss__sub_build_near(s);
+    if ((r = tss__sub_build_parts(s)) == TSS_OK) r = tss__sub_build_near(s, 0, &s->near_ptr, &s->near_id);
     if (r != TSS_OK) return r;
     s->built = 1, s->topology = c->topology, s->patterns = patterns;
+    s->setup_seconds += tss__sub_clock(s) - from;
     return TSS_OK;
 }
 // ---------------------------------------------------------------------------------------------
@@ -4801,21 +4807,17 @@ static void tss__sub_near_add(const tss_subspace *s, const tss_iterate *it, cons
 // ‖(g^i)_j‖ of one node: summed (ours), or the root of the sum of squares (literal).
 static double tss__sub_ring_gradient(const tss_subspace *s, const tss_iterate *it, const tss_unknowns *u, int node,
                                      tss__sub_near *n) {
-    const int *ptr = tss__sub_i(&s->near_ptr), *id = tss__sub_i(&s->near_id);
     int list[TSS_BATCH];
     n->count = 0;
-    for (int k = ptr[node]; k < ptr[node + 1];) {
-        tss_energy_view v;
-        int e = id[2 * k], m = 0;
-        while (k < ptr[node + 1] && id[2 * k] == e && m < TSS_BATCH) list[m++] = id[2 * k++ + 1];
-        if (tss_energy_get(s->w, e, &v) == TSS_OK) tss__sub_near_add(s, it, u, &v, list, m, n);
-    }
-    const int *dp = tss__sub_i(&s->dyn_ptr), *di = tss__sub_i(&s->dyn_id);
-    for (int k = dp[node]; k < dp[node + 1];) {
-        tss_energy_view v;
-        int e = di[2 * k], m = 0;
-        while (k < dp[node + 1] && di[2 * k] == e && m < TSS_BATCH) list[m++] = di[2 * k++ + 1];
-        if (tss_energy_get(s->w, e, &v) == TSS_OK) tss__sub_near_add(s, it, u, &v, list, m, n);
+    for (int dynamic = 0; dynamic < 2; dynamic++) {
+        const int *ptr = tss__sub_i(dynamic ? &s->dyn_ptr : &s->near_ptr);
+        const int *id = tss__sub_i(dynamic ? &s->dyn_id : &s->near_id);
+        for (int k = ptr[node]; k < ptr[node + 1];) {
+            tss_energy_view v;
+            int e = id[2 * k], m = 0;
+            while (k < ptr[node + 1] && id[2 * k] == e && m < TSS_BATCH) list[m++] = id[2 * k++ + 1];
+            if (tss_energy_get(s->w, e, &v) == TSS_OK) tss__sub_near_add(s, it, u, &v, list, m, n);
+        }
     }
     double sum = 0, squares = 0;
     for (int k = 0; k < n->count; k++) {
@@ -4823,33 +4825,6 @@ static double tss__sub_ring_gradient(const tss_subspace *s, const tss_iterate *i
         sum += l, squares += l * l;
     }
     return s->def.oracle == TSS_ORACLE_LITERAL ? sqrt(squares) : sum;
-}
-
-// node → stencils of the lists that change (contact, friction).
-static tss_result tss__sub_dynamic_near(tss_subspace *s) {
-    size_t n = (size_t)s->n;
-    int *ptr = (int *)tss__sub_need(s, &s->dyn_ptr, n + 1, sizeof(int));
-    if (!ptr) return tss__sub_no_memory(s);
-    memset(ptr, 0, (n + 1) * sizeof(int));
-    for (int pass = 0; pass < 2; pass++) {
-        int *out = tss__sub_i(&s->dyn_id);
-        for (int e = 0; e < tss_world_energies(s->w); e++) {
-            tss_energy_view v;
-            if (tss_energy_get(s->w, e, &v) != TSS_OK || !(v.def->flags & TSS_ENERGY_DYNAMIC)) continue;
-            for (int k = 0; k < v.list.count * v.def->arity; k++) {
-                int node = v.list.node[k];
-                if (node < 0 || tss__sub_i(&s->body_of)[node] < 0) continue;
-                if (pass == 0) { ptr[node + 1]++; continue; }
-                out[2 * ptr[node]] = e, out[2 * ptr[node]++ + 1] = k / v.def->arity;
-            }
-        }
-        if (pass == 1) break;
-        for (size_t i = 0; i < n; i++) ptr[i + 1] += ptr[i];
-        if (!tss__sub_need(s, &s->dyn_id, 2 * (size_t)ptr[n], sizeof(int))) return tss__sub_no_memory(s);
-    }
-    for (size_t i = n; i > 0; i--) ptr[i] = ptr[i - 1];
-    ptr[0] = 0;
-    return TSS_OK;
 }
 
 typedef struct tss__sub_ask {
@@ -5092,7 +5067,7 @@ static tss_result tss__sub_own_direction(tss_subspace *s, const tss_iterate *it,
 static tss_result tss__sub_ask_oracle(tss_subspace *s, const tss_iterate *it, const tss_unknowns *u) {
     int open = 0, blocks = 0;
     s->added = 0;
-    tss_result r = tss__sub_dynamic_near(s);
+    tss_result r = tss__sub_build_near(s, 1, &s->dyn_ptr, &s->dyn_id);
     if (r != TSS_OK) return r;
     tss__sub_ask q;
     memset(&q, 0, sizeof q);
@@ -5716,10 +5691,6 @@ static tss_result tss__sub_add_blocks(tss_subspace *s, int body, int basis, cons
     m->blocks += b->b.blocks;
     m->stale = 1;
     return TSS_OK;
-}
-
-static double tss__sub_clock(const tss_subspace *s) {
-    return s->host.clock ? s->host.clock(s->host.clock_ctx) : 0;
 }
 
 tss_result tss_basis_add(tss_world *w, tss_body body, const tss_basis_def *def, tss_basis *out) {
