@@ -2415,6 +2415,7 @@ typedef struct tss__sub_part {  // a subdomain: the secant stencils of one group
     int nodes;
     int valid, fresh;           // has a secant; H^ℓ is set
     int skipped;                // the last BFGS update was not safe
+    int used;                   // nodes of the stencils it holds; 0: H^ℓ = 0
     int64_t node0, row0, col0;  // its nodes, row pointers (from 0) and columns start here
     size_t h, g;                // offsets of H^ℓ (a × a) and of the last modal gradient (a)
 } tss__sub_part;
@@ -3397,6 +3398,12 @@ typedef struct tss__sub_run {
 
 #define TSS__SUB_STENCIL (8 * 3)  // widest row of a stencil's Hessian: arity 8 in 3D
 
+static int tss__sub_nonzero(const double *blk, int dd) {
+    double size = 0;
+    for (int q = 0; q < dd; q++) size += fabs(blk[q]);
+    return size > 0;
+}
+
 // y[0..n) += v · x[0..n)
 static void tss__sub_axpy(int n, double v, const double *x, double *y) {
     for (int k = 0; k < n; k++) y[k] += v * x[k];
@@ -3508,21 +3515,29 @@ static void tss__sub_hessian_task(int p, int worker, void *arg) {
     double *out = run->work + (size_t)worker * run->each, *K = out + TSS_BATCH * TSS__SUB_STENCIL * TSS__SUB_STENCIL;
     double *phi = K + (size_t)row[t->nodes] * (size_t)dd, *vec = phi + (size_t)t->nodes * (size_t)c;
     double *T = vec + (size_t)t->nodes * (size_t)(d * r), *H = tss__sub_f(&s->secant) + t->h;
-    int *local = (int *)(void *)(T + (size_t)t->nodes * (size_t)(d * a));
+    int *local = (int *)(void *)(T + (size_t)t->nodes * (size_t)(d * a)), *kept = local + t->nodes, *at = kept + t->nodes;
     memset(K, 0, (size_t)row[t->nodes] * (size_t)dd * sizeof(double));
-    memset(T, 0, (size_t)t->nodes * (size_t)(d * a) * sizeof(double));
     memset(H, 0, (size_t)a * (size_t)a * sizeof(double));
     tss__sub_part_stiffness(run, p, K, out);
-    tss__sub_rows(s, t->modal, node, t->nodes, 0, local, phi, vec);
-    for (int i = 0; i < t->nodes; i++)
+    t->used = 0;  // nodes of held stencils: where much is enriched, few are left
+    for (int i = 0; i < t->nodes; i++) {
+        at[i] = -1;
         for (int k = row[i]; k < row[i + 1]; k++) {
-            if (col[k] == i)
-                memcpy(tss__sub_f(&s->part_diag) + (size_t)(t->node0 + i) * (size_t)dd, K + (size_t)k * (size_t)dd,
-                       (size_t)dd * sizeof(double));
-            tss__sub_row_times(d, c, r, K + (size_t)k * (size_t)dd, phi + (size_t)col[k] * (size_t)c,
-                               vec + (size_t)col[k] * (size_t)(d * r), T + (size_t)i * (size_t)(d * a));
+            const double *blk = K + (size_t)k * (size_t)dd;
+            if (col[k] != i) continue;
+            memcpy(tss__sub_f(&s->part_diag) + (size_t)(t->node0 + i) * (size_t)dd, blk, (size_t)dd * sizeof(double));
+            if (tss__sub_nonzero(blk, dd)) at[i] = t->used;
         }
-    tss__sub_gather(d, t->nodes, a, T, c, r, phi, vec, 1, H);
+        if (at[i] >= 0) kept[t->used++] = node[i];
+    }
+    memset(T, 0, (size_t)t->used * (size_t)(d * a) * sizeof(double));
+    tss__sub_rows(s, t->modal, kept, t->used, 0, local, phi, vec);
+    for (int i = 0; i < t->nodes; i++)
+        for (int k = row[i]; at[i] >= 0 && k < row[i + 1]; k++)
+            if (at[col[k]] >= 0)
+                tss__sub_row_times(d, c, r, K + (size_t)k * (size_t)dd, phi + (size_t)at[col[k]] * (size_t)c,
+                                   vec + (size_t)at[col[k]] * (size_t)(d * r), T + (size_t)at[i] * (size_t)(d * a));
+    tss__sub_gather(d, t->used, a, T, c, r, phi, vec, 1, H);
     t->fresh = 1;
 }
 
@@ -3570,7 +3585,7 @@ static void tss__sub_bfgs_task(int p, int worker, void *arg) {
     const tss__sub_run *run = (const tss__sub_run *)arg;
     tss_subspace *s = run->s;
     tss__sub_part *t = tss__sub_parts(s, p);
-    if (!t->valid || !t->fresh || t->nodes == 0) return;
+    if (!t->valid || !t->fresh || t->used == 0) return;
     const tss__modal *m = tss__sub_modal(s, t->modal);
     const int a = m->a;
     const double *step = tss__sub_f(&m->s);
@@ -4011,7 +4026,7 @@ static void tss__sub_sum_task(int j, int worker, void *arg) {
     memset(to, 0, a * sizeof(double));
     for (int p = m->group0; p < m->group0 + m->groups; p++) {
         const tss__sub_part *t = tss__sub_parts(u->s, p);
-        if (t->valid && t->fresh)
+        if (t->valid && t->fresh && t->used > 0)
             tss__sub_axpy((int)a - j, 1, tss__sub_f(&u->s->secant) + t->h + (size_t)j * a + j, to + j);
     }
 }
@@ -4368,12 +4383,6 @@ static tss_result tss__sub_link(tss_subspace *s, int *count, tss__sub_buf *list,
     return TSS_OK;
 }
 
-static int tss__sub_nonzero(const double *blk, int dd) {
-    double size = 0;
-    for (int q = 0; q < dd; q++) size += fabs(blk[q]);
-    return size > 0;
-}
-
 // Blocks of row `row` towards enriched nodes (border 0: index among them) or towards border nodes.
 static tss_result tss__sub_link_row(tss_subspace *s, const tss_unknowns *u, int row, int border, int *count, tss__sub_buf *list) {
     const int dd = s->dim * s->dim;
@@ -4531,14 +4540,14 @@ static void tss__sub_schur_apply(void *user, const double *x, double *y) {
     if (r != TSS_OK) s->failed = r;
 }
 
-// d_x by conjugate gradients; *ok 0: not converged within bound.
-static tss_result tss__sub_pcg(tss_subspace *s, const double *b, double *x, int bound, tss__sub_counts *n, int *ok) {
+// d_x by conjugate gradients, from x if warm; *ok 0: not converged within bound.
+static tss_result tss__sub_pcg(tss_subspace *s, const double *b, double *x, int bound, int warm, tss__sub_counts *n, int *ok) {
     tss_result r = s->pcg ? TSS_OK : tss_pcg_create(&s->host, &s->pcg);
     if (r != TSS_OK) return tss__sub_no_memory(s);
     tss_pcg_def d = tss_pcg_def_default();
     tss_pcg_info info;
     d.n = s->xrows, d.d = s->dim, d.A = &s->Ax, d.B = &s->Cx, d.fixed = s->masked ? tss__sub_u(&s->xmask) : NULL;
-    d.apply = tss__sub_schur_apply, d.user = s, d.tol = s->def.pcg_tol, d.max_iterations = bound;
+    d.apply = tss__sub_schur_apply, d.user = s, d.tol = s->def.pcg_tol, d.max_iterations = bound, d.warm = warm;
     s->failed = TSS_OK;
     r = tss_pcg_solve(s->pcg, &d, b, x, &info);
     if (r == TSS_OK) r = s->failed;
@@ -4737,7 +4746,14 @@ static tss_result tss__sub_solve_enriched(tss_subspace *s, const tss_unknowns *u
         tss__sub_minus_J(s, q, b);
         for (size_t k = 0; s->masked && k < nx; k++)
             if (tss__sub_u(&s->xmask)[k]) b[k] = 0;
-        if ((r = tss__sub_pcg(s, b, dx, bound, &s->counts, &ok)) != TSS_OK) return r;
+        if ((r = tss__sub_pcg(s, b, dx, bound, 0, &s->counts, &ok)) != TSS_OK) return r;
+        if (!ok && s->def.schur == TSS_SCHUR_AUTO && !analyzed) {
+            // the bound was that of the floor: what a direct solve really costs allows more
+            if ((r = tss__sub_analyze_x(s, &direct)) != TSS_OK) return r;
+            double left = direct / tss__sub_pcg_work(s) - bound;
+            analyzed = 1, bound = left < 10000 ? (int)left + 1 : 10000;
+            if (left > 0 && (r = tss__sub_pcg(s, b, dx, bound, 1, &s->counts, &ok)) != TSS_OK) return r;
+        }
         if (ok || s->def.schur == TSS_SCHUR_PCG) {
             if ((r = tss__sub_Jt(s, dx, q)) != TSS_OK) return r;
             for (size_t k = 0; k < s->modes; k++) q[k] = rq[k] - q[k];
@@ -4910,33 +4926,37 @@ static int tss__sub_enrich(tss_subspace *s, int g) {
     return count;
 }
 
-// The functions of one block at all nodes of its body: (nodes × f), or (nodes · d) × f columns.
-static tss_result tss__sub_block_rows(tss_subspace *s, int body, const tss__sub_block *q, double **out, int *width) {
+// Doubles that the functions of one block take at all nodes of its body; *width: their number f.
+static size_t tss__sub_block_room(const tss_subspace *s, int body, const tss__sub_block *q, int *width) {
+    const tss__sub_basis *b = tss__sub_base(s, q->basis);
+    *width = b->b.first[q->block + 1] - b->b.first[q->block];
+    return (size_t)tss__sub_modal(s, body)->nodes * (size_t)(b->b.vector ? s->dim : 1) * (size_t)*width;
+}
+
+// U: (nodes × f), or (nodes · d) × f columns.
+static void tss__sub_block_rows(const tss_subspace *s, int body, const tss__sub_block *q, double *U) {
     const tss__modal *m = tss__sub_modal(s, body);
     const tss__sub_basis *b = tss__sub_base(s, q->basis);
-    const int f0 = b->b.first[q->block], f = b->b.first[q->block + 1] - f0;
-    size_t rows = (size_t)m->nodes * (size_t)(b->b.vector ? s->dim : 1);
-    double *U = (double *)tss__sub_need(s, &s->columns, rows * (size_t)f, sizeof(double));
-    if (!U) return tss__sub_no_memory(s);
+    int f;
+    size_t rows = tss__sub_block_room(s, body, q, &f) / (size_t)f;
     if (b->b.vector)
         for (size_t i = 0; i < rows; i++)
-            for (int k = 0; k < f; k++) U[i * (size_t)f + (size_t)k] = b->b.value[i * (size_t)b->b.columns + (size_t)(f0 + k)];
+            for (int k = 0; k < f; k++)
+                U[i * (size_t)f + (size_t)k] = b->b.value[i * (size_t)b->b.columns + (size_t)(b->b.first[q->block] + k)];
     else
         tss__basis_rows(&b->b, tss__sub_X(s, m), s->dim, NULL, m->nodes, &q->block, 1, U, f);
-    *out = U, *width = f;
-    return TSS_OK;
 }
 
 // 𝒢_s (Eq. 12, 14, 16): g^s = M Φ Φᵀ∇E, Φ the block's functions, orthonormal in the mass; max over
 // the nodes of ‖g_j^s‖ l/η_j, which meshes agree on; as printed ‖g_j^s‖/γ_j.
-static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
+// U: room for the block's rows and 3 f sums behind them.
+static void tss__sub_block_error(const tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q, double *U) {
     const tss__modal *m = tss__sub_modal(s, body);
     const int d = s->dim, vector = tss__sub_base(s, q->basis)->b.vector, literal = s->def.oracle == TSS_ORACLE_LITERAL;
-    double *U, ah2 = tss__sub_ah2(s, it->ctx), all = 0;
+    double ah2 = tss__sub_ah2(s, it->ctx), all = 0;
     int f = 0;
-    tss_result r = tss__sub_block_rows(s, body, q, &U, &f);
-    double *sum = (double *)tss__sub_need(s, &s->small_work, (size_t)(3 * f), sizeof(double));
-    if (r != TSS_OK || !sum) return r != TSS_OK ? r : tss__sub_no_memory(s);
+    double *sum = U + tss__sub_block_room(s, body, q, &f);
+    tss__sub_block_rows(s, body, q, U);
     const double *mass = tss_world_masses(s->w) + m->first, *g = it->g + m->first * d;
     memset(sum, 0, (size_t)(3 * f) * sizeof(double));
     for (int i = 0; i < m->nodes; i++) {
@@ -4957,11 +4977,10 @@ static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, i
         double e = mass[i] / all * tss__sub_norm(v, d) / (ah2 * scale);
         q->error = e > q->error ? e : q->error;
     }
-    if (s->query) return TSS_OK;
+    if (s->query) return;
     double now = q->error, last = it->number == 0 ? 0 : q->last;
     if (!literal && last < now) q->error = last;
     q->last = now;
-    return TSS_OK;
 }
 
 // ℰ_s (Eq. 13, 15, 17): c^s = M Φ̄ Φ̄ᵀ ΔE, Φ̄ the functions averaged over coordinates;
@@ -4969,11 +4988,13 @@ static tss_result tss__sub_block_error(tss_subspace *s, const tss_iterate *it, i
 static tss_result tss__sub_block_progress(tss_subspace *s, const tss_iterate *it, int body, tss__sub_block *q) {
     const tss__modal *m = tss__sub_modal(s, body);
     const int d = tss__sub_base(s, q->basis)->b.vector ? s->dim : 1, literal = s->def.oracle == TSS_ORACLE_LITERAL;
-    double *U, ah2 = tss__sub_ah2(s, it->ctx), all = 0, sum = 0, total = 0;
+    double ah2 = tss__sub_ah2(s, it->ctx), all = 0, sum = 0, total = 0;
     int f = 0;
-    tss_result r = tss__sub_block_rows(s, body, q, &U, &f);
-    double *c = (double *)tss__sub_need(s, &s->small_work, (size_t)f, sizeof(double));
-    if (r != TSS_OK || !c) return r != TSS_OK ? r : tss__sub_no_memory(s);
+    size_t room = tss__sub_block_room(s, body, q, &f);
+    double *U = (double *)tss__sub_need(s, &s->columns, room + (size_t)f, sizeof(double));
+    if (!U) return tss__sub_no_memory(s);
+    double *c = U + room;
+    tss__sub_block_rows(s, body, q, U);
     const double *mass = tss_world_masses(s->w) + m->first;
     memset(c, 0, (size_t)f * sizeof(double));
     for (int i = 0; i < m->nodes; i++) {
@@ -4999,17 +5020,41 @@ static int tss__sub_candidate(const tss__modal *m, const tss__sub_block *q) {
     return !q->active && m->enriched < m->modal_nodes;
 }
 
+typedef struct tss__sub_modes {
+    const tss_subspace *s;
+    const tss_iterate *it;
+    int body;
+    double *work;
+    size_t each;
+} tss__sub_modes;
+
+static void tss__sub_mode_task(int j, int worker, void *arg) {
+    const tss__sub_modes *run = (const tss__sub_modes *)arg;
+    const tss__modal *m = tss__sub_modal(run->s, run->body);
+    tss__sub_block *q = tss__sub_blocks(m) + j;
+    if (tss__sub_candidate(m, q))
+        tss__sub_block_error(run->s, run->it, run->body, q, run->work + (size_t)worker * run->each);
+}
+
 // Errors of all inactive blocks; *open: some are above ε_G.
 static tss_result tss__sub_mode_errors(tss_subspace *s, const tss_iterate *it, int *open) {
-    tss_result r = TSS_OK;
-    for (int k = 0; k < s->modal_count; k++)
-        for (int j = 0; j < tss__sub_modal(s, k)->blocks && r == TSS_OK; j++) {
-            tss__sub_block *q = tss__sub_blocks(tss__sub_modal(s, k)) + j;
-            if (!tss__sub_candidate(tss__sub_modal(s, k), q)) continue;
-            r = tss__sub_block_error(s, it, k, q);
-            *open |= q->error > s->def.error_modes;
+    for (int k = 0; k < s->modal_count; k++) {
+        const tss__modal *m = tss__sub_modal(s, k);
+        tss__sub_modes run = {s, it, k, NULL, 0};
+        for (int j = 0; j < m->blocks; j++) {
+            int f;
+            if (!tss__sub_candidate(m, tss__sub_blocks(m) + j)) continue;
+            size_t room = tss__sub_block_room(s, k, tss__sub_blocks(m) + j, &f) + (size_t)(3 * f);
+            run.each = room > run.each ? room : run.each;
         }
-    return r;
+        if (run.each == 0) continue;
+        run.work = (double *)tss__sub_need(s, &s->columns, run.each * (size_t)tss_workers(&s->host), sizeof(double));
+        if (!run.work) return tss__sub_no_memory(s);
+        tss_parallel(&s->host, m->blocks, tss__sub_mode_task, &run);
+        for (int j = 0; j < m->blocks; j++)
+            *open |= tss__sub_candidate(m, tss__sub_blocks(m) + j) && tss__sub_blocks(m)[j].error > s->def.error_modes;
+    }
+    return TSS_OK;
 }
 
 // Those of them that lack progress join; returns in *added how many.
