@@ -571,10 +571,22 @@ static void fill_log(run *r, const double *value) {
     if (!(*lo <= *hi)) *lo = *hi = 0;
 }
 
+// The oracle's fields at the state that is shown: the last iterate of a step that converged had
+// little left to ask about. Where the question fails, the fields of that iterate are shown.
+static void ask_oracle(run *r, tss_subspace_info *sub) {
+    if (tss_subspace_query(r->w) != TSS_OK)
+        fprintf(stderr, "oracle: %s\n", tss_world_error(r->w));
+    tss_subspace_get_info(r->sub, sub);
+}
+
 static void fill_field(run *r) {
     tss_subspace_info sub;
+    int field = r->s.frames.field;
     memset(&sub, 0, sizeof sub);
-    if (r->sub) tss_subspace_get_info(r->sub, &sub);
+    if (r->sub && (field == SCENE_FIELD_ERROR || field == SCENE_FIELD_PROGRESS))
+        ask_oracle(r, &sub);
+    else if (r->sub)
+        tss_subspace_get_info(r->sub, &sub);
     switch (r->s.frames.field) {
         case SCENE_FIELD_VELOCITY:
             fill_speed(r);
@@ -859,7 +871,7 @@ static int oracle_fields(run *r, tss_field out[4]) {
     int n = tss_world_nodes(r->w);
     tss_subspace_info sub;
     if (!r->sub) return 0;
-    tss_subspace_get_info(r->sub, &sub);
+    ask_oracle(r, &sub);
     if (!r->oracle) r->oracle = (double *)need(4 * (size_t)n, sizeof(double));
     for (int i = 0; i < n; i++) {
         r->oracle[i] = sub.enriched ? sub.enriched[i] : 0;
