@@ -49,7 +49,7 @@ draw() {
     fig11) picture fig11 fig11_roller 9 --set "frames.size=[600,400]" ;;
     fig12) picture fig12 fig12_boat 8 ;;
     fig13) picture fig13 fig13_city 8 --set bodies.0.shape.cells=18 --set "frames.size=[600,400]" ;;
-    fig14) picture fig14 jello_rubber 22 --set bodies.0.material.E=1e5 --set 'bodies.0.shape.cells=[16,8,16]' --set "frames.size=[600,400]" ;;
+    fig14) picture fig14 fig14_jello 22 --set bodies.0.material.E=1e5 --set 'bodies.0.shape.cells=[16,8,16]' --set "frames.size=[600,400]" ;;
     fig15) picture fig15 fig15_fist 5 ;;
     fig17) picture fig17 fig10_beam 8 --set 'bodies.0.basis={"kind": "eigen", "count": 48, "initial": -1}' ;;
     fig18) picture fig18 fig18_koosh 8 ;;

@@ -21,7 +21,7 @@ row() {
 for reading in ring literal; do
     for eps in 0.5 0.1 0.01; do
         for E in 1e5 1e6 1e9; do
-            row "jello_$E" $reading $eps jello_rubber 6 --set 'bodies.0.shape.cells=[16,8,16]' --set bodies.1.shape.cells=12 \
+            row "jello_$E" $reading $eps fig14_jello 6 --set 'bodies.0.shape.cells=[16,8,16]' --set bodies.1.shape.cells=12 \
                 --set "bodies.0.material.E=$E"
         done
         row ramp $reading $eps fig5_ramp 60 --set 'bodies.0.shape.cells=[6,6,6]'

@@ -86,7 +86,8 @@
    shape                   {kind, ...}, then the body's scale, rotate, translate
     ball ellipsoid cylinder capsule torus cone koosh roller spikes spring anvil mushroom fist hand
     peak hull              solids about 1 m across: cells (over 1 m), count, ratio: tss_shapes.h
-    box                    lower, upper, cells (each axis), split 5 | 6
+    box                    lower, upper, cells (each axis), split 5 | 6; grade: last cell's size over
+                           the first's, each axis (1)
     terrain                lower, upper, cells; height and wave: of its hills, m
     sheet hills            surfaces at y = 0: lower, upper, cells (x, z); hills: height, wave
     spike_sheet            lower, upper, cells, height
@@ -707,7 +708,7 @@ static int scene__read_array(scene__reader *r, const cJSON *array, scene__read_f
 
 typedef struct scene__shape {
     int kind, cells[3], count, split;
-    double lower[3], upper[3], ratio, radius, height, wave;
+    double lower[3], upper[3], grade[3], ratio, radius, height, wave;
     unsigned given;  // bit k: key k of scene__shape_keys was there
 } scene__shape;
 
@@ -730,11 +731,12 @@ enum {
     SCENE__RADIUS = 32,
     SCENE__HEIGHT = 64,
     SCENE__WAVE = 128,
-    SCENE__SPLIT = 256
+    SCENE__SPLIT = 256,
+    SCENE__GRADE = 512
 };
 #define SCENE__BOX (SCENE__LOWER | SCENE__UPPER | SCENE__CELLS)
 #define SCENE__SHAPES(X)                                                                          \
-    X(BOX, "box", SCENE__BOX | SCENE__SPLIT)                                                      \
+    X(BOX, "box", SCENE__BOX | SCENE__SPLIT | SCENE__GRADE)                                       \
     X(TERRAIN, "terrain", SCENE__BOX | SCENE__HEIGHT | SCENE__WAVE)                               \
     X(SHEET, "sheet", SCENE__BOX)                                                                 \
     X(HILLS, "hills", SCENE__BOX | SCENE__HEIGHT | SCENE__WAVE)                                   \
@@ -786,6 +788,15 @@ static int scene__read_cells(scene__reader *r, const cJSON *v, void *base) {
     return got > 0;
 }
 
+static int scene__read_grade(scene__reader *r, const cJSON *v, void *base) {
+    double *grade = ((scene__shape *)base)->grade;
+    if (scene__read_numbers(r, v, 3, 3, grade) != 3) return 0;
+    for (int c = 0; c < 3; c++)
+        if (!(grade[c] >= 1e-3 && grade[c] <= 1e3))
+            return scene__expected(r, v, "numbers from 1e-3 to 1e3");
+    return 1;
+}
+
 static const scene__key scene__shape_keys[] = {
     SCENE__FUN("cells", scene__read_cells),
     SCENE__OF(SCENE__VECTOR, scene__shape, lower, "lower"),
@@ -796,18 +807,19 @@ static const scene__key scene__shape_keys[] = {
     SCENE__NUM(scene__shape, height, "height", 0, 1e9),
     SCENE__POS(scene__shape, wave, "wave"),
     SCENE__INT(scene__shape, split, "split", 5, 6),
+    SCENE__FUN("grade", scene__read_grade),
     SCENE__ONE(scene__shape, kind, "kind", scene__shape_names),
     SCENE__END};
 
 static int scene__read_shape(scene__reader *r, const cJSON *v, scene__shape *d) {
     memset(d, 0, sizeof *d);
     d->kind = -1, d->split = 5, d->radius = 0.5, d->height = 1, d->wave = 1, d->ratio = -1;
-    for (int c = 0; c < 3; c++) d->lower[c] = -0.5, d->upper[c] = 0.5;
+    for (int c = 0; c < 3; c++) d->lower[c] = -0.5, d->upper[c] = 0.5, d->grade[c] = 1;
     if (!scene__read_object(r, v, scene__shape_keys, d)) return 0;
     if (d->kind < 0) return scene__fail(r->error, "%s: %s.kind is missing", r->s->file, r->where);
     unsigned uses = d->kind < TSS_SHAPE_COUNT ? SCENE__CELLS | SCENE__N | SCENE__RATIO
                                               : scene__shape_uses[d->kind - TSS_SHAPE_COUNT];
-    for (int k = 0; k < 9; k++)
+    for (int k = 0; k < 10; k++)
         if (!(uses >> k & 1) && cJSON_GetObjectItemCaseSensitive(v, scene__shape_keys[k].name))
             return scene__fail(r->error, "%s: %s.%s has no meaning for a \"%s\"", r->s->file,
                                r->where, scene__shape_keys[k].name, scene__shape_names[d->kind]);
@@ -830,7 +842,7 @@ static tss_result scene__make_shape(const scene__shape *d, tss_mesh *out) {
     scene__hills hills = {d->height, d->wave};
     switch (d->kind) {
         case SCENE__SHAPE_BOX:
-            return tss_shape_box(NULL, lo, hi, n, d->split, NULL, out);
+            return tss_shape_box(NULL, lo, hi, n, d->split, d->grade, out);
         case SCENE__SHAPE_TERRAIN:
             return tss_shape_terrain_block(NULL, lo, hi, n, scene__height, &hills, out);
         case SCENE__SHAPE_SHEET:
