@@ -348,20 +348,25 @@ static void fig11(void) {
     close_run(&with), close_run(&without);
 }
 
-// Mean of the full-space residual over the five steps with the most Newton iterates; *part: share
-// enriched there, *modes: active there.
+// Mean of the full-space residual over the five steps with the most Newton iterates among those that
+// begin in contact; *part: share enriched there, *modes: active there. In the step of the impact
+// itself the far side of the boat is still at rest: no threshold on a relative error asks for nodes
+// there.
 static double hardest(const char *extra, const char *also, double *part, double *modes) {
-    keys k = sized("bodies.0.shape.cells=22", "world.steps=9", NULL);
+    keys k = sized("bodies.0.shape.cells=22", "world.steps=8", NULL);
     double res[64], count[64], en[64], mo[64], sum = 0;
     run r;
     int n = 0, taken[64] = {0};
     add(&k, extra), add(&k, also);
     open_run(&r, "fig12_boat", &k);
-    for (int s = 0; s < r.s.world.steps && n < 64; s++, n++) {
+    for (int s = 0; s < r.s.world.steps && n < 64; s++) {
+        int touching = r.info.contacts > 0;
         step(&r);
+        if (!touching) continue;
         res[n] = r.info.residual_newton, count[n] = r.info.newton;
-        en[n] = (double)r.info.enriched_nodes / r.info.nodes, mo[n] = r.info.active_modes;
+        en[n] = (double)r.info.enriched_nodes / r.info.nodes, mo[n++] = r.info.active_modes;
     }
+    if (n < 5) stop(&r, "fewer than five steps in contact");
     *part = *modes = 0;
     for (int q = 0; q < 5; q++) {
         int best = -1;
