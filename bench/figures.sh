@@ -1,7 +1,7 @@
 #!/bin/sh
 # The claims of paper A's figures, measured. bench/figures.sh [-b BUILD] [-o OUT] [NAME...]
 # Names: fig2 fig3 fig4 fig5 fig9 fig10 fig11 fig12 fig13 fig14 fig15 fig17 fig18 pile; none: all but
-# fig12, fig15 and fig18, which take minutes. Each prints `NAME key value ...`. With --pictures also
+# fig15 and fig18, which take minutes. Each prints `NAME key value ...`. With --pictures also
 # OUT/NAME.png. Scenes: examples/scenes/; larger meshes by `build/tss run SCENE --set KEY=VALUE`.
 set -u
 build=build; out=out/figures; pictures=0
@@ -13,7 +13,7 @@ while [ $# -gt 0 ]; do
     *) break ;;
     esac
 done
-names=${*:-fig2 fig3 fig4 fig5 fig9 fig10 fig11 fig13 fig14 fig17 pile}
+names=${*:-fig2 fig3 fig4 fig5 fig9 fig10 fig11 fig12 fig13 fig14 fig17 pile}
 cc=${CC:-cc}
 flags="-std=c11 -O3 -march=native -fopenmp -I. -Iexamples -D_POSIX_C_SOURCE=200809L"
 mkdir -p "$build" "$out"
@@ -42,15 +42,15 @@ picture() {
 draw() {
     case $1 in
     fig2) picture fig2 fig2_spikes 12 ;;
-    fig4) picture fig4 fig4_cone 7 ;;
+    fig4) picture fig4 fig4_cone 7 --color error --set camera.elevation=-25 --set "frames.size=[480,400]" ;;
     fig5) picture fig5 fig5_ramp 60 ;;
     fig9) picture fig9 fig9_cube 8 ;;
     fig10) picture fig10 fig10_beam 8 ;;
     fig11) picture fig11 fig11_roller 9 --set "frames.size=[600,400]" ;;
-    fig12) picture fig12 fig12_boat 8 ;;
+    fig12) picture fig12 fig12_boat 8 --set "frames.size=[480,480]" ;;
     fig13) picture fig13 fig13_city 8 --set bodies.0.shape.cells=18 --set "frames.size=[600,400]" ;;
     fig14) picture fig14 fig14_jello 22 --set bodies.0.material.E=1e5 --set 'bodies.0.shape.cells=[16,8,16]' --set "frames.size=[600,400]" ;;
-    fig15) picture fig15 fig15_fist 5 ;;
+    fig15) picture fig15 fig15_fist 5 --set "frames.size=[600,400]" ;;
     fig17) picture fig17 fig10_beam 8 --set 'bodies.0.basis={"kind": "eigen", "count": 48, "initial": -1}' ;;
     fig18) picture fig18 fig18_koosh 8 ;;
     esac
