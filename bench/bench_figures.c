@@ -349,9 +349,9 @@ static void fig11(void) {
 }
 
 // Mean of the full-space residual over the five steps with the most Newton iterates among those that
-// begin in contact; *part: share enriched there, *modes: active there. In the step of the impact
-// itself the far side of the boat is still at rest: no threshold on a relative error asks for nodes
-// there.
+// begin in contact; *part: share enriched there, *modes: active there. The step of the impact itself
+// is left out: at 0.01 it has strains below the threshold left over, and a residual above the
+// tolerance (see throughout).
 static double hardest(const char *extra, const char *also, double *part, double *modes) {
     keys k = sized("bodies.0.shape.cells=22", "world.steps=8", NULL);
     double res[64], count[64], en[64], mo[64], sum = 0;
@@ -378,6 +378,23 @@ static double hardest(const char *extra, const char *also, double *part, double 
     return sum;
 }
 
+// Largest full-space residual of all steps, the impact included; *part: share enriched in it.
+static double throughout(const char *extra, double *part) {
+    keys k = sized("bodies.0.shape.cells=22", "world.steps=8", NULL);
+    double most = 0;
+    run r;
+    add(&k, extra), add(&k, "solver.error_modes=0.5");
+    open_run(&r, "fig12_boat", &k);
+    *part = 0;
+    for (int s = 0; s < r.s.world.steps; s++) {
+        step(&r);
+        if (r.info.residual_newton < most) continue;
+        most = r.info.residual_newton, *part = (double)r.info.enriched_nodes / r.info.nodes;
+    }
+    close_run(&r);
+    return most;
+}
+
 // Fig. 12: the thresholds trade nodes and modes for the full-space residual.
 static void fig12(void) {
     static const char *const nodes[] = {"solver.error_nodes=10", "solver.error_nodes=1",
@@ -400,8 +417,15 @@ static void fig12(void) {
                mr[k]);
         fflush(stdout);
     }
+    double all_part[2], all[2] = {throughout("solver.error_nodes=0.01", all_part),
+                                  throughout("solver.error_nodes=0.005", all_part + 1)};
+    for (int k = 0; k < 2; k++)
+        printf("fig12 all_steps error_nodes=%s worst_residual %.2e enriched %.3f\n",
+               k ? "0.005" : "0.01", all[k], all_part[k]);
     judge("fig12: residual falls and nodes grow with the nodal threshold", falls && grows);
-    judge("fig12: at 0.01 the full-space tolerance is met", res[4] <= 1e-3 && part[4] > 0.95);
+    judge("fig12: at 0.01 the full-space tolerance is met in the steps that begin in contact",
+          res[4] <= 1e-3 && part[4] > 0.95);
+    judge("fig12: at 0.005 it is met in every step, the impact included", all[1] <= 1e-3);
     judge("fig12: modes grow with the modal threshold",
           mm[0] <= mm[1] && mm[1] <= mm[2] && mm[2] > mm[0]);
 }
