@@ -41,9 +41,11 @@ picture() {
 
 draw() {
     case $1 in
-    fig2) picture fig2 fig2_spikes 12 ;;
-    fig4) picture fig4 fig4_cone 7 --color error --set camera.elevation=-25 --set "frames.size=[480,400]" ;;
-    fig5) picture fig5 fig5_ramp 60 ;;
+    fig2) picture fig2 fig2_spikes 12 --set bodies.0.shape.cells=20 --set "frames.size=[480,400]" ;;
+    fig4)
+        picture fig4 fig4_cone 7 --color error --set camera.elevation=-25 --set "frames.size=[480,400]"
+        picture fig4_progress fig4_cone 7 --color progress --set camera.elevation=-25 --set "frames.size=[480,400]" ;;
+    fig5) picture fig5 fig5_ramp 60 --set "frames.size=[480,320]" --set "camera.target=[0.55,-0.1,0]" --set camera.distance=2.2 ;;
     fig9) picture fig9 fig9_cube 8 ;;
     fig10) picture fig10 fig10_beam 8 ;;
     fig11) picture fig11 fig11_roller 9 --set "frames.size=[600,400]" ;;
@@ -53,6 +55,7 @@ draw() {
     fig15) picture fig15 fig15_fist 5 --set "frames.size=[600,400]" ;;
     fig17) picture fig17 fig10_beam 8 --set 'bodies.0.basis={"kind": "eigen", "count": 48, "initial": -1}' ;;
     fig18) picture fig18 fig18_koosh 8 ;;
+    pile) picture pile pile 8 --set "frames.size=[480,400]" --set camera.elevation=65 --set camera.distance=6 ;;
     esac
 }
 
