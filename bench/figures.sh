@@ -54,7 +54,7 @@ draw() {
     fig14) picture fig14 fig14_jello 22 --set bodies.0.material.E=1e5 --set 'bodies.0.shape.cells=[16,8,16]' --set "frames.size=[600,400]" ;;
     fig15) picture fig15 fig15_fist 5 --set "frames.size=[600,400]" ;;
     fig17) picture fig17 fig10_beam 8 --set 'bodies.0.basis={"kind": "eigen", "count": 48, "initial": -1}' ;;
-    fig18) picture fig18 fig18_koosh 8 ;;
+    fig18) picture fig18 fig18_koosh 11 ;;
     pile) picture pile pile 8 --set "frames.size=[480,400]" --set camera.elevation=65 --set camera.distance=6 ;;
     esac
 }

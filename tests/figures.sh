@@ -17,5 +17,5 @@ else echo "FAILED  fig3: stencil descent needs more sweeps on finer meshes, Newt
 
 $cc -std=c11 -O3 -march=native -fopenmp -I. -Iexamples -D_POSIX_C_SOURCE=200809L bench/bench_figures.c \
     -o "$build/bench_figures_small" -lcjson -lmetis -lm || { echo "FAILED  figures: bench_figures.c does not build"; exit 1; }
-"$build/bench_figures_small" examples/scenes --small fig2 fig4 fig5 fig9 fig10 fig11 fig12 fig13 fig14 fig15 fig17 || bad=1
+"$build/bench_figures_small" examples/scenes --small fig2 fig4 fig5 fig9 fig10 fig11 fig12 fig13 fig14 fig15 fig17 fig18 || bad=1
 exit $bad
