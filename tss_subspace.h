@@ -3585,6 +3585,7 @@ static void tss__sub_bfgs_task(int p, int worker, void *arg) {
     const tss__sub_run *run = (const tss__sub_run *)arg;
     tss_subspace *s = run->s;
     tss__sub_part *t = tss__sub_parts(s, p);
+    t->skipped = 0;
     if (!t->valid || !t->fresh || t->used == 0) return;
     const tss__modal *m = tss__sub_modal(s, t->modal);
     const int a = m->a;
@@ -4746,13 +4747,16 @@ static tss_result tss__sub_solve_enriched(tss_subspace *s, const tss_unknowns *u
         tss__sub_minus_J(s, q, b);
         for (size_t k = 0; s->masked && k < nx; k++)
             if (tss__sub_u(&s->xmask)[k]) b[k] = 0;
+        int before = s->counts.linear_iterations;
         if ((r = tss__sub_pcg(s, b, dx, bound, 0, &s->counts, &ok)) != TSS_OK) return r;
-        if (!ok && s->def.schur == TSS_SCHUR_AUTO && !analyzed) {
+        if (!ok && !analyzed && s->def.schur == TSS_SCHUR_AUTO && s->counts.linear_iterations - before == bound) {
             // the bound was that of the floor: what a direct solve really costs allows more
             if ((r = tss__sub_analyze_x(s, &direct)) != TSS_OK) return r;
             double left = direct / tss__sub_pcg_work(s) - bound;
             analyzed = 1, bound = left < 10000 ? (int)left + 1 : 10000;
             if (left > 0 && (r = tss__sub_pcg(s, b, dx, bound, 1, &s->counts, &ok)) != TSS_OK) return r;
+            double all = s->counts.linear_iterations - before;
+            if (all > s->pcg_iterations) s->pcg_iterations = all;
         }
         if (ok || s->def.schur == TSS_SCHUR_PCG) {
             if ((r = tss__sub_Jt(s, dx, q)) != TSS_OK) return r;

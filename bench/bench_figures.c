@@ -309,7 +309,7 @@ static void fig9(void) {
     double fine = cube("bodies.0.shape.cells=[22,22,22]", NULL, g + 1);
     double graded =
         cube("bodies.0.shape.cells=[18,18,18]", "bodies.0.shape.grade=[2,3,2]", g + 2);
-    double stiff = cube("bodies.0.shape.cells=[14,14,14]", "bodies.0.material.E=1e8", g + 3);
+    double stiff = cube("bodies.0.shape.cells=[16,16,16]", "bodies.0.material.E=1e8", g + 3);
     double least = fmin(coarse, fmin(fine, graded)), most = fmax(coarse, fmax(fine, graded));
     printf("fig9 coarse %.3f fine %.3f graded %.3f stiff %.3f spread %.2f groups %d %d %d\n",
            coarse, fine, graded, stiff, most / least, g[0], g[1], g[2]);
@@ -490,7 +490,7 @@ static void fig14(void) {
           soft > rubber && rubber > 0 && stiff == 0);
 }
 
-// Share enriched when 25 ms have passed, 10 ms after the fist has met the head.
+// Share enriched when 25 ms have passed; the fist meets the head after 5.5 ms.
 static double fist(const char *dt, const char *steps) {
     keys k = sized("bodies.0.shape.cells=12", "bodies.1.shape.cells=12", NULL);
     run r;

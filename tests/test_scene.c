@@ -129,6 +129,11 @@ static void test_refusals(void **state) {
     refused("{\"bodies\": [{\"shape\": {}}]}", "bodies[0].shape.kind is missing", NULL);
     refused("{\"bodies\": [{\"shape\": {\"kind\": \"box\", \"radius\": 1}}]}", "shape.radius",
             "no meaning");
+    refused("{\"bodies\": [{\"shape\": {\"kind\": \"box\", \"grade\": [1, 0, 1]}}]}", "shape.grade",
+            "1e-3 to 1e3");
+    refused("{\"bodies\": [{\"shape\": {\"kind\": \"box\", \"grade\": [1, 2]}}]}", "shape.grade", NULL);
+    refused("{\"bodies\": [{\"shape\": {\"kind\": \"ball\", \"grade\": [1, 2, 1]}}]}", "shape.grade",
+            "no meaning");
     refused("{\"bodies\": [{\"shape\": {\"kind\": \"sheet\"}}]}", "bodies[0]",
             "\"obstacle\": true");
     refused("{\"bodies\": [{" BOX ", \"scale\": 0}]}", "bodies[0].scale", "other than 0");
