@@ -1106,12 +1106,14 @@ static void tss__kernel_emit(const tss__basis_work *w, const tss__kernel_space *
 // whole basis, so the projected matrix is known entry by entry and a restart only has to keep the
 // best Ritz vectors. A block method sees as many copies of a multiple eigenvalue as it has columns;
 // for those beyond, a found set must survive a fresh random block before it is accepted: without,
-// thirty equal pieces gave 8 copies of their lowest eigenvalue, then wrong ones.
+// thirty equal pieces gave 8 copies of their lowest eigenvalue, then wrong ones. A fresh block takes
+// the place of what was left of the residuals, which the estimate then no longer sees: the residuals
+// of the pairs themselves decide, and inverse iteration goes on until they meet the tolerance.
 // Cost: one factorisation and solves of 8 right-hand sides (on cubes 26 of them for 16 modes, 64
 // for 64, 88 for 100); while it works, modes + 64 or 2 modes + 16 vectors, whichever is more.
 // ---------------------------------------------------------------------------------------------
 
-enum { TSS__EIG_BLOCK = 8, TSS__EIG_CYCLES = 60 };
+enum { TSS__EIG_BLOCK = 8, TSS__EIG_CYCLES = 60, TSS__EIG_POLISH = 4 };
 
 typedef struct tss__eig {
     tss__basis_work *w;
@@ -1387,13 +1389,16 @@ static tss_result tss__eig_solve(tss__eig *e, int count, double *lambda) {
     double *U = tss__eig_column(e, given), *W = tss__eig_column(e, count);
     if (e->want) tss__tall_rotate(&e->tall, e->m, e->V, e->Y, e->want, e->V);
     memmove(U, e->V, (size_t)e->want * (size_t)e->N * sizeof(double));
-    r = tss__eig_polish(e, e->want, U, lambda + given, W);
-    if (r != TSS_OK) return r;
     // The kernel stays out of the finished vectors by projection, so it is put in last.
     double *V = e->V;
-    e->V = U;
-    tss__eig_finish(e, e->want, lambda + given);
-    e->V = V;
+    for (int pass = 0; pass < TSS__EIG_POLISH; pass++) {
+        e->residual = 0;
+        if ((r = tss__eig_polish(e, e->want, U, lambda + given, W)) != TSS_OK) return r;
+        e->V = U;
+        tss__eig_finish(e, e->want, lambda + given);
+        e->V = V;
+        if (e->residual <= e->w->def->tol) break;
+    }
     tss__kernel_emit(e->w, &e->kernel, e->d == 1 && !e->w->fixed, given, V);
     return TSS_OK;
 }
