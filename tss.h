@@ -859,7 +859,7 @@ TSS_API tss_result tss_world_probe(tss_world *w);
 TSS_API void tss_world_clock_phase(tss_world *w, tss_phase p);
 
 // Takes x, v, the integrator's memory, time, targets and what energies remember from a world built by the same
-// calls (contact stiffness, lagged friction); direction finder and linear solver stay as they are.
+// calls (contact stiffness, lagged friction); tolerance, direction finder and linear solver stay as they are.
 TSS_API tss_result tss_world_copy_state(tss_world *to, const tss_world *from);
 
 // Lamé parameters (Pa) and density (kg/m³) of a body's cell; any of them may be NULL.
@@ -9986,7 +9986,7 @@ tss_result tss_world_copy_state(tss_world *to, const tss_world *from) {
     if ((r = tss__copy_energies(to, from)) != TSS_OK) return r;
     for (int k = 0; k < count; k++) memcpy(out[k]->p, in[k]->p, bytes[k]);
     to->steps = from->steps, to->history = from->history, to->time = from->time;
-    to->ctx.ah2 = from->ctx.ah2, to->def.dt = from->def.dt, to->def.tol = from->def.tol;
+    to->ctx.ah2 = from->ctx.ah2, to->def.dt = from->def.dt;
     memcpy(to->def.gravity, from->def.gravity, sizeof to->def.gravity);
     to->unchecked = from->unchecked ? 2 : 0;
     tss__fill_ctx(to);

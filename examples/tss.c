@@ -65,7 +65,8 @@ typedef struct options {
     const char *command, *scene, *assets, *frames, *resume, *snapshots;
     char out[512], mode[80], color[80];  // mode, color: as key=value
     const char *set[MAX_SETS];
-    int sets, steps, threads, every, check, repeat, from, free_steps, count;
+    const char *nodes, *modes, *tols;  // of a sweep
+    int sets, steps, threads, every, check, repeat, from, free_steps, count, sweep;
     double budget_ms;
 } options;
 
@@ -170,6 +171,9 @@ static int take(options *o, const char *name, const char *value) {
     if (strcmp(name, "--frames") == 0) return o->frames = value, 1;
     if (strcmp(name, "--resume") == 0) return o->resume = value, 1;
     if (strcmp(name, "--snapshots") == 0) return o->snapshots = value, 1;
+    if (strcmp(name, "--nodes") == 0) return o->nodes = value, 1;
+    if (strcmp(name, "--modes") == 0) return o->modes = value, 1;
+    if (strcmp(name, "--tols") == 0) return o->tols = value, 1;
     if (strcmp(name, "--mode") == 0) return take_key(o, "solver.mode", value, o->mode);
     if (strcmp(name, "--color") == 0) return take_color(o, value);
     if (strcmp(name, "--set") == 0) return add_set(o, value);
@@ -183,10 +187,13 @@ static int take(options *o, const char *name, const char *value) {
 static int read_options(int argc, char **argv, options *o) {
     memset(o, 0, sizeof *o);
     o->steps = o->free_steps = -1, o->repeat = 1;
+    o->nodes = "1,0.5,0.2,0.1,0.05,0.02", o->modes = "0.5,0.05";
     o->command = argv[1];
     for (int k = 2; k < argc; k++) {
         if (strcmp(argv[k], "--check") == 0)
             o->check = 1;
+        else if (strcmp(argv[k], "--sweep") == 0)
+            o->sweep = 1;
         else if (argv[k][0] == '-' && argv[k][1]) {
             if (!take(o, argv[k], argv[k + 1])) return 0;
             k++;
@@ -784,17 +791,22 @@ static void label_frame(const run *r, view_image *im) {
     view_colour_bar(im, field_map(r), lo, hi, unit);
 }
 
-static int draw_frame(run *r) {
+// The scene at x3, coloured by field; rgb NULL: no memory.
+static view_image render_scene(run *r) {
     double lo[3], hi[3];
-    char path[700];
-    view_error why;
     view_look look = scene_look(r);
     scene_box(r, lo, hi);
     view_begin(r->view, &r->camera, &look);
     for (int b = 0; b < r->s.bodies; b++) draw_body(r, b);
     for (int k = 0; k < r->s.planes; k++)
         if (r->s.world.dim == 2 || !level(&r->s.plane[k])) draw_plane(r, &r->s.plane[k], lo, hi);
-    view_image im = view_render(r->view);
+    return view_render(r->view);
+}
+
+static int draw_frame(run *r) {
+    char path[700];
+    view_error why;
+    view_image im = render_scene(r);
     if (!im.rgb) return fail(r, "out of memory for a picture");
     label_frame(r, &im);
     snprintf(path, sizeof path, "%s/frames/%04d.png", r->o.out, r->step);
@@ -1663,8 +1675,11 @@ static int compare(run *r, contest *t) {
     return 1;
 }
 
+#include "sweep.h"
+
 static int command_compare(run *r) {
     contest t;
+    if (r->o.sweep) return command_sweep(r);
     memset(&t, 0, sizeof t);
     int ok = read_scene(r) && compare(r, &t);
     for (int k = 0; k < SOLVERS; k++) tss_world_destroy(t.c[k].w), free(t.c[k].kept);
