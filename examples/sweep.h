@@ -52,7 +52,7 @@ typedef struct sweep {
 
 static const char *sweep_name(const run *r, char text[120]) {
     const char *name = strrchr(r->o.scene, '/');
-    name = name ? name + 1 : r->o.scene;
+    name = r->o.name ? r->o.name : name ? name + 1 : r->o.scene;
     snprintf(text, 120, "%.*s", (int)strcspn(name, "."), name);
     return text;
 }
@@ -398,6 +398,16 @@ static int sweep_pictures(run *r, sweep *s) {
     return ok;
 }
 
+// Bases are made once and read by the other worlds; the reference and full space have none.
+static void sweep_cache(run *r) {
+    for (int b = 0; b < r->s.bodies; b++)
+        for (int k = 0; k < r->s.body[b].bases; k++) {
+            scene_basis *p = &r->s.body[b].basis[k];
+            if (!p->cache[0])
+                snprintf(p->cache, sizeof p->cache, "%.400s/basis_%d_%d.bin", r->o.out, b, k);
+        }
+}
+
 static int sweep_run(run *r, sweep *s) {
     size_t size;
     double started;
@@ -407,7 +417,9 @@ static int sweep_run(run *r, sweep *s) {
     if (s->steps < 1)
         return fail(r, "%s: --from %d leaves no step to compare (the scene has %d)", r->o.scene,
                     r->o.from, r->s.world.steps);
-    if (!sweep_worlds(r, s) || !make_folder(r, out_folder(r)) || !sweep_open(r, s)) return 0;
+    if (!make_folder(r, out_folder(r))) return 0;
+    sweep_cache(r);
+    if (!sweep_worlds(r, s) || !sweep_open(r, s)) return 0;
     for (int k = 0; k < r->o.from; k++)
         if (!step_world(r, s->ref.w, k + 1, &s->ref.info)) return 0;
     void *start = save_world(s->ref.w, &size), *motions = save_motions(r);

@@ -65,7 +65,7 @@ typedef struct options {
     const char *command, *scene, *assets, *frames, *resume, *snapshots;
     char out[512], mode[80], color[80];  // mode, color: as key=value
     const char *set[MAX_SETS];
-    const char *nodes, *modes, *tols;  // of a sweep
+    const char *nodes, *modes, *tols, *name;  // of a sweep
     int sets, steps, threads, every, check, repeat, from, free_steps, count, sweep;
     double budget_ms;
 } options;
@@ -171,6 +171,7 @@ static int take(options *o, const char *name, const char *value) {
     if (strcmp(name, "--frames") == 0) return o->frames = value, 1;
     if (strcmp(name, "--resume") == 0) return o->resume = value, 1;
     if (strcmp(name, "--snapshots") == 0) return o->snapshots = value, 1;
+    if (strcmp(name, "--name") == 0) return o->name = value, 1;
     if (strcmp(name, "--nodes") == 0) return o->nodes = value, 1;
     if (strcmp(name, "--modes") == 0) return o->modes = value, 1;
     if (strcmp(name, "--tols") == 0) return o->tols = value, 1;
