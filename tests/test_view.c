@@ -478,13 +478,16 @@ static void test_report(void **state) {
     report_heading(r, "Head <1>"), report_text(r, "a < b & c > d");
     const char *names[2] = {"dt", "file"}, *values[2] = {"0.01 s", "a\"b\"<c>&.msh"};
     report_table(r, "Scene & more", names, values, 2);
-    report_series s[3] = {{"one <a>", t, a, N}, {"two & b", t, b, N}, {"gap", NULL, gap, N}};
+    report_series s[3] = {{"one <a>", t, a, N, NULL, REPORT_SOLID, 0},
+                          {"two & b", t, b, N, NULL, REPORT_SOLID, 0},
+                          {"gap", NULL, gap, N, NULL, REPORT_SOLID, 0}};
     report_plot p = report_plot_default("lines <&>", "time, s", "n"), q = p, l = p;
     q.stacked = 1, l.log_y = 1, l.markers = 1, l.note = "a note";
     report_add_plot(r, &p, s, 2), report_add_plot(r, &q, s, 2), report_add_plot(r, &l, s + 2, 1);
     double none[2] = {NAN, NAN}, one[1] = {3};
-    report_series empty = {"none", NULL, none, 2}, single = {"one", NULL, one, 1},
-                  zero = {"zero", NULL, NULL, 0};
+    report_series empty = {"none", NULL, none, 2, NULL, REPORT_SOLID, 0},
+                  single = {"one", NULL, one, 1, NULL, REPORT_SOLID, 0},
+                  zero = {"zero", NULL, NULL, 0, NULL, REPORT_SOLID, 0};
     report_add_plot(r, &p, &empty, 1), report_add_plot(r, &p, &single, 1),
         report_add_plot(r, &p, &zero, 1);
     report_add_plot(r, &l, &empty, 1), report_add_plot(r, &q, &zero, 1);
