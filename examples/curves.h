@@ -202,6 +202,8 @@ CURVES_API void curves_draw_summary(report *r, const curves *c);
 CURVES_API void curves_draw_scene(report *r, const curves *c, int scene, const char *pictures);
 CURVES_API void curves_draw_errors(report *r, const curves *c, int scene, curves_measure m,
                                    const char *title);
+CURVES_API void curves_draw_verdict(report *r, const curves *c, int scene, curves_measure m,
+                                    const char *lead);
 CURVES_API void curves_draw_advice(report *r, const curves *c, int scene);
 CURVES_API void curves_draw_pictures(report *r, const curves *c, int scene, const char *folder);
 CURVES_API void curves_draw_steps(report *r, const curves *c, int scene);
@@ -902,9 +904,12 @@ void curves_draw_errors(report *r, const curves *c, int scene, curves_measure m,
         for (int i = 0; i < count; i++) {
             const curves_row *at = &c->row[row[i]];
             double error = curves_error_of(at, m);
-            if (error < least) error = least, low = 1;
+            int under = error < least;
+            if (under) error = least, low = 1;
             x[used + i] = at->seconds, y[used + i] = 100 * error;
-            label[used + i] = curves__g(curves__swept(at), text[used + i]);
+            // Of those on the lower edge only the first, or they hide each other.
+            if (!under || i == 0 || y[used + i - 1] > y[used + i])
+                label[used + i] = curves__g(curves__swept(at), text[used + i]);
         }
         if (!count) continue;
         s[series].name = curves__names[method], s[series].x = x + used, s[series].y = y + used;
@@ -914,7 +919,7 @@ void curves_draw_errors(report *r, const curves *c, int scene, curves_measure m,
         used += count, series++;
     }
     report_plot p = report_plot_default(title, "run time, s", "error, %");
-    p.log_x = p.log_y = p.markers = 1;
+    p.log_x = p.log_y = p.markers = 1, p.height = 400;
     if (low) p.note = "Errors below the lower edge are drawn on it.";
     report_add_plot(r, &p, s, series);
     free(x), free(row), free(text), free((void *)label);
@@ -1316,8 +1321,8 @@ void curves_draw_summary(report *r, const curves *c) {
         "own tolerance; above 1 adaptive is faster.");
 }
 
-static void curves__draw_verdict(report *r, const curves *c, int scene, curves_measure m,
-                                 const char *lead) {
+void curves_draw_verdict(report *r, const curves *c, int scene, curves_measure m,
+                         const char *lead) {
     char text[1200], all[1300];
     curves_verdict v = curves_dominates(c, scene, m);
     curves_verdict_text(c, scene, m, text, sizeof text);
@@ -1326,12 +1331,12 @@ static void curves__draw_verdict(report *r, const curves *c, int scene, curves_m
 }
 
 void curves_draw_scene(report *r, const curves *c, int scene, const char *pictures) {
-    curves__draw_verdict(r, c, scene, CURVES_MAX, "Largest error of a step");
+    curves_draw_verdict(r, c, scene, CURVES_MAX, "Largest error of a step");
     report_columns_begin(r);
     curves_draw_errors(r, c, scene, CURVES_MAX, "Largest error of a step");
     curves_draw_errors(r, c, scene, CURVES_FINAL, "Distance at the end of the free trajectory");
     report_columns_end(r);
-    curves__draw_verdict(r, c, scene, CURVES_FINAL, "Distance at the end, of the diagonal");
+    curves_draw_verdict(r, c, scene, CURVES_FINAL, "Distance at the end, of the diagonal");
     curves_draw_pictures(r, c, scene, pictures);
     curves_draw_advice(r, c, scene);
     curves_draw_steps(r, c, scene);

@@ -87,6 +87,7 @@ typedef struct report_plot {
     int stacked;  // areas on top of each other (same x; log_y is ignored)
     int markers;  // dots at the points
     int zero;     // a linear y axis starts at 0 (if nothing is negative)
+    int height;   // of a width of 720; 0: 300
 } report_plot;
 
 // subtitle may be NULL. NULL: no memory; every function then does nothing.
@@ -647,7 +648,7 @@ static void report__minor(report *r, const report__axis *a, const report__axis *
 static void report__grid(report *r, const report_plot *p, const report__axis *x,
                          const report__axis *y) {
     report__text *t = &r->body;
-    double tick[12];
+    double tick[12], foot = y->at_lo + REPORT__BOTTOM;
     char text[40];
     int n = report__ticks(y, 6, tick);
     report__minor(r, y, x, 0);
@@ -672,7 +673,7 @@ static void report__grid(report *r, const report_plot *p, const report__axis *x,
     report__format(r, t, "<path class=\"axis\" d=\"M%f %fH%f\"/>\n", x->at_lo, y->at_lo, x->at_hi);
     if (p->x_label)
         report__format(r, t, "<text x=\"%f\" y=\"%f\" class=\"label\">%s</text>\n",
-                       0.5 * (x->at_lo + x->at_hi), (double)REPORT__H - 6, p->x_label);
+                       0.5 * (x->at_lo + x->at_hi), foot - 6, p->x_label);
     if (p->y_label)
         report__format(
             r, t, "<text transform=\"translate(13 %f) rotate(-90)\" class=\"label\">%s</text>\n",
@@ -860,15 +861,15 @@ void report_add_plot(report *r, const report_plot *plot, const report_series *se
     if (!r || count <= 0) return;
     report_plot p = *plot;
     report__axis x = {0, 0, REPORT__LEFT, REPORT__W - REPORT__RIGHT, p.log_x};
-    report__axis y = {0, 0, REPORT__H - REPORT__BOTTOM, REPORT__TOP, p.log_y && !p.stacked};
-    int dropped = 0;
+    int dropped = 0, height = p.height > 100 ? p.height : REPORT__H;
+    report__axis y = {0, 0, height - REPORT__BOTTOM, REPORT__TOP, p.log_y && !p.stacked};
     report__ranges(&p, series, count, &x, &y, &dropped);
     report__put(r, &r->body, "<figure class=\"plot\">");
     if (p.title) report__format(r, &r->body, "<figcaption>%s</figcaption>", p.title);
     report__format(
         r, &r->body,
         "<div class=\"scroll\"><svg viewBox=\"0 0 %d %d\" role=\"img\" aria-label=\"%s\">\n",
-        REPORT__W, REPORT__H, p.title ? p.title : "plot");
+        REPORT__W, height, p.title ? p.title : "plot");
     // Areas would hide the grid: it is drawn after them.
     if (p.stacked) report__areas(r, series, count, &x, &y);
     report__grid(r, &p, &x, &y);
@@ -918,7 +919,7 @@ void report_add_bars(report *r, const report_plot *plot, const char *const *name
     }
     report__axis x = {0, most > 0 ? most : 1, REPORT__BAR_LEFT, REPORT__W - 60, 0};
     bottom = 8.0 + 26 * bars;
-    report__put(r, &r->body, "<figure class=\"plot\">");
+    report__put(r, &r->body, "<figure class=\"plot bars\">");
     if (plot->title) report__format(r, &r->body, "<figcaption>%s</figcaption>", plot->title);
     report__format(r, &r->body,
                    "<div class=\"scroll\"><svg viewBox=\"0 0 %d %d\" role=\"img\" "
@@ -1024,6 +1025,7 @@ static const char *const report__style_of_parts =
     ".columns{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(500px,100%),1fr));gap:"
     "0 18px}.columns>*{min-width:0}.columns .plot{margin:9px 0}.columns .plot text{font-size:14px}"
     ".columns .plot .at{font-size:13px}\n"
+    ".bars svg{max-width:860px}\n"
     ".side{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(240px,100%),1fr));"
     "overflow:visible}\n"
     ".note{color:var(--soft);font-size:13px;margin:4px 0 0}\n"
@@ -1035,8 +1037,10 @@ static const char *const report__style_of_parts =
     "var(--rule);font-weight:400;overflow-wrap:anywhere}th{color:var(--soft)}"
     "td{font-variant-numeric:tabular-nums}\n"
     ".caption{font-weight:600;margin:18px 0 6px}.cells{margin:0;font-size:14px;min-width:100%}"
-    ".cells th{font-size:13px;vertical-align:bottom;background:var(--card)}.cells td,.cells "
-    "th{padding:4px 10px;overflow-wrap:normal}.cells .n{text-align:right;white-space:nowrap}"
+    ".cells th{font-size:13px;line-height:1.3;vertical-align:bottom;background:var(--card)}.cells "
+    "td,.cells "
+    "th{padding:4px 10px;overflow-wrap:normal}.cells .n{text-align:right}.cells "
+    "td.n{white-space:nowrap}"
     ".cells tbody tr:last-child td{border-bottom:0}.cells .good{color:var(--good);font-weight:600}"
     ".cells .warn{color:var(--warn);font-weight:600}.cells .bad{color:var(--bad);font-weight:600}"
     ".scroll{margin:4px 0}.cells+*{margin-top:10px}\n"
@@ -1072,11 +1076,11 @@ static int report__write(report *r, const report__text *head, const char *direct
                          const char *file) {
     static const char end[] = "</body>\n</html>\n";
     char path[1024], temporary[1040];
-    if (strlen(directory) + strlen(file) > sizeof path - 32) {
+    int fits = snprintf(path, sizeof path, "%s/%s", directory, file);
+    if (fits < 0 || fits > (int)sizeof path - 32) {
         report__fail(r, directory, "the name is too long");
         return 0;
     }
-    snprintf(path, sizeof path, "%s/%s", directory, file);
     snprintf(temporary, sizeof temporary, "%s.part", path);
     FILE *f = fopen(temporary, "wb");
     if (!f) {
