@@ -59,11 +59,12 @@ static double number(const curves_table *t, int row, int column) {
     return *s && !*end ? v : NAN;
 }
 
-// Numbers to four digits, words as they are.
+// As written where that is short, or else to four digits.
 static const char *shown(const curves_table *t, int row, int column, char text[40]) {
+    const char *s = curves_cell(t, row, column);
     double v = number(t, row, column);
-    if (v != v) return curves_cell(t, row, column);
-    snprintf(text, 40, fabs(v) >= 1e4 && fabs(v) < 1e7 ? "%.0f" : "%.4g", v);
+    if (v != v || strlen(s) < 8) return s;
+    snprintf(text, 40, fabs(v) >= 1e4 && fabs(v) < 1e10 ? "%.0f" : "%.4g", v);
     return text;
 }
 

@@ -1013,7 +1013,7 @@ static const char *const report__style_of_parts =
     "i{display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px;vertical-"
     "align:-1px}"
     ".legend i.dashed,.legend i.dotted{height:4px;vertical-align:3px;opacity:.75}\n"
-    "nav{display:flex;flex-wrap:wrap;gap:4px 22px;margin:0 0 20px;padding-bottom:10px;"
+    "nav{display:flex;flex-wrap:wrap;gap:4px 22px;margin:12px 0 20px;padding-bottom:10px;"
     "border-bottom:1px solid var(--rule)}nav a,nav b{font-size:15px}a{color:var(--info)}\n"
     ".callout{background:var(--card);border:1px solid var(--rule);border-left:4px solid "
     "var(--info);border-radius:6px;padding:10px 14px;margin:12px 0;max-width:none}"
