@@ -59,12 +59,29 @@ static double number(const curves_table *t, int row, int column) {
     return *s && !*end ? v : NAN;
 }
 
-// As written where that is short, or else to four digits.
-static const char *shown(const curves_table *t, int row, int column, char text[40]) {
+// 1040350780 as 1 040 350 780, with narrow spaces that do not break.
+static void grouped(const char *digits, char text[64]) {
+    size_t n = strlen(digits), used = 0;
+    for (size_t i = 0; i < n && used < 56; i++) {
+        if (i > 0 && (n - i) % 3 == 0) memcpy(text + used, "\xe2\x80\xaf", 3), used += 3;
+        text[used++] = digits[i];
+    }
+    text[used] = 0;
+}
+
+// As written where that is short, or else grouped or to four digits.
+static const char *shown(const curves_table *t, int row, int column, char text[64]) {
     const char *s = curves_cell(t, row, column);
     double v = number(t, row, column);
-    if (v != v || strlen(s) < 8) return s;
-    snprintf(text, 40, fabs(v) >= 1e4 && fabs(v) < 1e10 ? "%.0f" : "%.4g", v);
+    if (v != v) return s;
+    if (strlen(s) > 4 && strlen(s) < 20 && strspn(s, "0123456789") == strlen(s))
+        grouped(s, text);
+    else if (fabs(v) > 0 && fabs(v) < 1e-4)
+        curves__g(v, text);
+    else if (strlen(s) > 6)
+        snprintf(text, 64, "%.4g", v);
+    else
+        return s;
     return text;
 }
 
@@ -234,11 +251,15 @@ static void grid_of(report *r, const curves_table *t, const char *caption, const
                     report_level (*level)(const curves_table *, int, int)) {
     size_t n = (size_t)t->rows * (size_t)t->columns;
     report_cell *cell = (report_cell *)calloc(n + 1, sizeof *cell);
-    char(*text)[40] = (char(*)[40])calloc(n + 1, sizeof *text);
+    char(*text)[64] = (char(*)[64])calloc(n + 1, sizeof *text);
     for (int i = 0; cell && text && i < t->rows; i++)
         for (int j = 0; j < t->columns; j++) {
             size_t k = (size_t)i * (size_t)t->columns + (size_t)j;
             cell[k].text = shown(t, i, j, text[k]), cell[k].level = level(t, i, j);
+            if (level == stability_level && (j == PATH_OK || j == FINITE))
+                cell[k].text = cell[k].level == REPORT_GOOD  ? "yes"
+                               : cell[k].level == REPORT_BAD ? "no"
+                                                             : "\xe2\x80\x93";
         }
     if (cell && text) report_grid(r, caption, heads, cell, t->columns, t->rows);
     free(cell), free(text);

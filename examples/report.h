@@ -618,7 +618,7 @@ enum {
     REPORT__RIGHT = 14,
     REPORT__TOP = 12,
     REPORT__BOTTOM = 44,
-    REPORT__BAR_LEFT = 190
+    REPORT__BAR_LEFT = 205
 };
 
 report_plot report_plot_default(const char *title, const char *x_label, const char *y_label) {
@@ -1041,6 +1041,7 @@ static const char *const report__style_of_parts =
     "td,.cells "
     "th{padding:4px 10px;overflow-wrap:normal}.cells .n{text-align:right}.cells "
     "td.n{white-space:nowrap}"
+    ".cells td.t:first-child{min-width:9em}.cells td.t:last-child{min-width:8em}"
     ".cells tbody tr:last-child td{border-bottom:0}.cells .good{color:var(--good);font-weight:600}"
     ".cells .warn{color:var(--warn);font-weight:600}.cells .bad{color:var(--bad);font-weight:600}"
     ".scroll{margin:4px 0}.cells+*{margin-top:10px}\n"
