@@ -167,6 +167,8 @@ static void page_index(source *s, report *r) {
     report_heading(r, "Small rerun on this machine");
     if (b > 0) curves_draw_summary(r, &small), curves_draw_comment(r, &small);
     if (b == 0) missing(r, "Small rerun (error_vs_time.csv)", "make report");
+    if (a > 0 || b > 0) curves_draw_key(r);
+    report_contents(r, large.scene, large.scenes);
     draw_scenes(r, s, &large, &small);
     curves_free(&large), curves_free(&small);
 }

@@ -199,6 +199,7 @@ CURVES_API void curves_draw(report *r, const curves *c, const char *pictures);  
 CURVES_API void curves_draw_tiles(report *r, const curves *c);
 CURVES_API void curves_draw_comment(report *r, const curves *c);
 CURVES_API void curves_draw_summary(report *r, const curves *c);
+CURVES_API void curves_draw_key(report *r);  // what the summary's columns mean
 CURVES_API void curves_draw_scene(report *r, const curves *c, int scene, const char *pictures);
 CURVES_API void curves_draw_errors(report *r, const curves *c, int scene, curves_measure m,
                                    const char *title);
@@ -1312,6 +1313,9 @@ void curves_draw_summary(report *r, const curves *c) {
         report_grid(r, "All scenes, by the largest error of a step", heads, cell, CURVES__SUMMARY,
                     c->scenes);
     free(cell), free(text);
+}
+
+void curves_draw_key(report *r) {
     report_text(
         r,
         "Cheapest over: the longest stretch of errors in which an adaptive run that keeps the "
@@ -1345,6 +1349,8 @@ void curves_draw_scene(report *r, const curves *c, int scene, const char *pictur
 void curves_draw(report *r, const curves *c, const char *pictures) {
     curves_draw_tiles(r, c);
     curves_draw_summary(r, c);
+    curves_draw_key(r);
+    if (c->scenes > 1) report_contents(r, c->scene, c->scenes);
     for (int s = 0; s < c->scenes; s++) {
         report_heading(r, c->scene[s]);
         curves_draw_scene(r, c, s, pictures);

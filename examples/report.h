@@ -95,6 +95,8 @@ REPORT_API report *report_begin(const char *title, const char *subtitle);
 // A tile in the summary at the top.
 REPORT_API void report_status(report *r, const char *name, const char *value, report_level level);
 REPORT_API void report_heading(report *r, const char *text);
+// Links to headings of this page, by their text.
+REPORT_API void report_contents(report *r, const char *const *headings, int count);
 REPORT_API void report_text(report *r, const char *text);
 // A paragraph that stands out, with the colour of its level.
 REPORT_API void report_note(report *r, const char *text, report_level level);
@@ -193,18 +195,19 @@ static void report__put(report *r, report__text *t, const char *s) {
 }
 
 // Escaped for text and for quoted attributes; control characters, which HTML forbids, become
-// spaces.
+// spaces; no line breaks before a % sign.
 static void report__escape(report *r, report__text *t, const char *s) {
     for (; s && *s; s++) {
         char one[2] = {*s, 0};
         if ((unsigned char)*s < 32 || *s == 127) one[0] = ' ';
         report__put(r, t,
-                    *s == '<'    ? "&lt;"
-                    : *s == '>'  ? "&gt;"
-                    : *s == '&'  ? "&amp;"
-                    : *s == '"'  ? "&quot;"
-                    : *s == '\'' ? "&#39;"
-                                 : one);
+                    *s == ' ' && s[1] == '%' ? "\xc2\xa0"
+                    : *s == '<'              ? "&lt;"
+                    : *s == '>'              ? "&gt;"
+                    : *s == '&'              ? "&amp;"
+                    : *s == '"'              ? "&quot;"
+                    : *s == '\''             ? "&#39;"
+                                             : one);
     }
 }
 
@@ -333,8 +336,32 @@ void report_status(report *r, const char *name, const char *value, report_level 
                        report__level(level), name, value);
 }
 
+// The name of a heading within the page: letters and digits, a dash for each other byte.
+static void report__anchor(const char *text, char name[64]) {
+    size_t n = 0;
+    for (; *text && n < 62; text++) {
+        int c = (unsigned char)*text;
+        int plain = (c >= '0' && c <= '9') || (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z');
+        name[n++] = (char)(plain || c == '_' ? c : '-');
+    }
+    name[n] = 0;
+}
+
 void report_heading(report *r, const char *text) {
-    if (r) report__format(r, &r->body, "<h2>%s</h2>\n", text);
+    char name[64];
+    report__anchor(text, name);
+    if (r) report__format(r, &r->body, "<h2 id=\"at-%s\">%s</h2>\n", name, text);
+}
+
+void report_contents(report *r, const char *const *headings, int count) {
+    char name[64];
+    if (!r || count <= 0) return;
+    report__put(r, &r->body, "<p class=\"contents\">");
+    for (int i = 0; i < count; i++) {
+        report__anchor(headings[i], name);
+        report__format(r, &r->body, "<a href=\"#at-%s\">%s</a>\n", name, headings[i]);
+    }
+    report__put(r, &r->body, "</p>\n");
 }
 
 void report_text(report *r, const char *text) {
@@ -648,7 +675,7 @@ static void report__minor(report *r, const report__axis *a, const report__axis *
 static void report__grid(report *r, const report_plot *p, const report__axis *x,
                          const report__axis *y) {
     report__text *t = &r->body;
-    double tick[12], foot = y->at_lo + REPORT__BOTTOM;
+    double tick[12], foot = y->at_lo + (double)REPORT__BOTTOM;
     char text[40];
     int n = report__ticks(y, 6, tick);
     report__minor(r, y, x, 0);
@@ -862,7 +889,7 @@ void report_add_plot(report *r, const report_plot *plot, const report_series *se
     report_plot p = *plot;
     report__axis x = {0, 0, REPORT__LEFT, REPORT__W - REPORT__RIGHT, p.log_x};
     int dropped = 0, height = p.height > 100 ? p.height : REPORT__H;
-    report__axis y = {0, 0, height - REPORT__BOTTOM, REPORT__TOP, p.log_y && !p.stacked};
+    report__axis y = {0, 0, (double)(height - REPORT__BOTTOM), REPORT__TOP, p.log_y && !p.stacked};
     report__ranges(&p, series, count, &x, &y, &dropped);
     report__put(r, &r->body, "<figure class=\"plot\">");
     if (p.title) report__format(r, &r->body, "<figcaption>%s</figcaption>", p.title);
@@ -1014,7 +1041,8 @@ static const char *const report__style_of_parts =
     "align:-1px}"
     ".legend i.dashed,.legend i.dotted{height:4px;vertical-align:3px;opacity:.75}\n"
     "nav{display:flex;flex-wrap:wrap;gap:4px 22px;margin:12px 0 20px;padding-bottom:10px;"
-    "border-bottom:1px solid var(--rule)}nav a,nav b{font-size:15px}a{color:var(--info)}\n"
+    "border-bottom:1px solid var(--rule)}.contents{display:flex;flex-wrap:wrap;gap:4px "
+    "18px;max-width:none}a{color:var(--info)}\n"
     ".callout{background:var(--card);border:1px solid var(--rule);border-left:4px solid "
     "var(--info);border-radius:6px;padding:10px 14px;margin:12px 0;max-width:none}"
     ".callout.good{border-left-color:var(--good)}.callout.warn{border-left-color:var(--warn)}"
@@ -1041,17 +1069,18 @@ static const char *const report__style_of_parts =
     "td,.cells "
     "th{padding:4px 10px;overflow-wrap:normal}.cells .n{text-align:right}.cells "
     "td.n{white-space:nowrap}"
-    ".cells td.t:first-child{min-width:9em}.cells td.t:last-child{min-width:8em}"
+    ".cells td.t:first-child{min-width:14em}.cells td.t:last-child{min-width:8em}"
     ".cells tbody tr:last-child td{border-bottom:0}.cells .good{color:var(--good);font-weight:600}"
     ".cells .warn{color:var(--warn);font-weight:600}.cells .bad{color:var(--bad);font-weight:600}"
     ".scroll{margin:4px 0}.cells+*{margin-top:10px}\n"
     "@media(max-width:640px){body{padding:20px 14px 40px}h1{font-size:23px}.plot{padding:10px}"
     ".plot svg{min-width:480px}.plot text{font-size:16px}.plot .at{font-size:14px}"
-    ".cells td,.cells th{padding:4px 8px}}\n"
-    "@media print{body{max-width:none;padding:0}.film{flex-wrap:wrap;overflow:visible}.film "
+    ".cells td,.cells th{padding:4px 8px}.cells td.t:first-child{min-width:8em}}\n"
+    "@media print{body{max-width:none;padding:0;background:#fff}.columns{grid-template-columns:1fr "
+    "1fr}.columns .plot text{font-size:17px}.film{flex-wrap:wrap;overflow:visible}.film "
     "figure{flex-basis:48%}.scroll{overflow:visible}.cells{font-size:9.5px}.cells th{font-size:"
     "9.5px}.cells td,.cells th{padding:2px 5px}figure,.callout,tr{break-inside:avoid}h2{break-"
-    "after:avoid}nav{display:none}}\n";
+    "after:avoid}nav,.contents{display:none}}\n";
 
 static void report__head(report *r, report__text *t) {
     report__format(r, t,

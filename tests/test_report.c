@@ -318,9 +318,10 @@ static void test_pages(void **state) {
     assert_true(write_pages(OUT, OUT "/small", OUT "/pages"));
     char *h = page("index.html");
     has(h, "machine: &lt;two&gt; cores\ncommand &amp; sizes");
-    has(h, "For 1 % error take error_nodes = 0.01, error_modes = 0.001: 3 s");
+    has(h, "error take error_nodes = 0.01, error_modes = 0.001: 3 s");
     has(h, "the direct solver takes 2.67 times as long, the best full-space solver 2.33 times");
     has(h, "Adaptive does not dominate over a decade of error");
+    has(h, "<h2 id=\"at-good\">"), has(h, "<a href=\"#at-bad\">bad</a>");
     has(h, "1 of 2 scenes"), has(h, "&lt;i&gt;x &amp; &quot;y&quot;, small");
     has(h, "<a href=\"stability.html\">"), has(h, "<a href=\"leave_out.html\">");
     has(h, "Largest error of a step: small rerun"), has(h, "line c2 dashed"),
