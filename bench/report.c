@@ -130,6 +130,11 @@ static void both(report *r, const source *s, const curves *large, int a, const c
     curves_draw_steps(r, large, a);
 }
 
+static const char *small_heading(const curves *small, int scene, char text[200]) {
+    snprintf(text, 200, "%.150s, small", small->scene[scene]);
+    return text;
+}
+
 static void draw_scenes(report *r, const source *s, const curves *large, const curves *small) {
     for (int k = 0; k < large->scenes; k++) {
         int b = scene_of(small, large->scene[k]);
@@ -142,10 +147,23 @@ static void draw_scenes(report *r, const source *s, const curves *large, const c
     for (int k = 0; k < small->scenes; k++) {
         char text[200];
         if (scene_of(large, small->scene[k]) >= 0) continue;
-        snprintf(text, sizeof text, "%.150s, small", small->scene[k]);
-        report_heading(r, text);
+        report_heading(r, small_heading(small, k, text));
         curves_draw_scene(r, small, k, s->out);
     }
+}
+
+// Links to the headings of draw_scenes.
+static void draw_contents(report *r, const curves *large, const curves *small) {
+    size_t most = (size_t)(large->scenes + small->scenes) + 1;
+    const char **heading = (const char **)calloc(most, sizeof *heading);
+    char(*text)[200] = (char(*)[200])calloc(most, sizeof *text);
+    int n = 0;
+    for (int k = 0; heading && text && k < large->scenes; k++) heading[n++] = large->scene[k];
+    for (int k = 0; heading && text && k < small->scenes; k++)
+        if (scene_of(large, small->scene[k]) < 0)
+            heading[n] = small_heading(small, k, text[n]), n++;
+    if (n > 1) report_contents(r, heading, n);
+    free((void *)heading), free(text);
 }
 
 static void page_index(source *s, report *r) {
@@ -168,7 +186,7 @@ static void page_index(source *s, report *r) {
     if (b > 0) curves_draw_summary(r, &small), curves_draw_comment(r, &small);
     if (b == 0) missing(r, "Small rerun (error_vs_time.csv)", "make report");
     if (a > 0 || b > 0) curves_draw_key(r);
-    report_contents(r, large.scene, large.scenes);
+    draw_contents(r, &large, &small);
     draw_scenes(r, s, &large, &small);
     curves_free(&large), curves_free(&small);
 }
