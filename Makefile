@@ -23,7 +23,7 @@ ifndef PARALLEL
 .NOTPARALLEL:
 endif
 
-.PHONY: help all deps demo test test-programs examples run-examples bench sanitize fuzz nodeps compat clean
+.PHONY: help all deps demo report test test-programs examples run-examples bench sanitize fuzz nodeps compat clean
 
 all: examples
 
@@ -39,6 +39,11 @@ demo: $(BUILD)/tss
 	$(BUILD)/tss run examples/scenes/demo.json -o $(OUT)/demo --frames png
 	@echo "open $(OUT)/demo/report.html"
 
+#: report        error against run time, stability, leaving out: out/report/*.html (under 30 minutes)
+report: $(BUILD)/tss $(BUILD)/report
+	@sh bench/report.sh -b $(BUILD) -o $(OUT)/report
+	@echo "open $(OUT)/report/index.html"
+
 #: examples      build every example
 examples: $(BUILD)/01_hello $(BUILD)/tss
 
@@ -49,6 +54,12 @@ run-examples: examples
 $(BUILD)/%: examples/%.c $(HEADERS) $(VIEWERS) tests/checker.h
 	@mkdir -p $(BUILD)
 	$(CC) $(ALL) $< -o $@ $(if $(filter tss,$*),-lcjson -lpng) $(LIBS)
+
+$(BUILD)/report: bench/report.c $(VIEWERS)
+	@mkdir -p $(BUILD)
+	$(CC) $(ALL) $< -o $@ -lm
+
+$(BUILD)/test_report: bench/report.c
 
 $(BUILD)/test_%: tests/test_%.c $(HEADERS) $(VIEWERS) $(wildcard tests/*.h)
 	@mkdir -p $(BUILD)

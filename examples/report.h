@@ -13,9 +13,10 @@
    report_error why;
    if (!report_end(r, "out/demo", &why)) fprintf(stderr, "%s\n", why.message);   // frees r
 
-   WHAT IT WRITES  DIR/report.html: no script, no other file, no network. Pictures are base64 PNG,
-   plots inline SVG: lines or stacked areas, linear or logarithmic axes, round tick labels, a
-   legend, points' values as tooltips. Light or dark as the reader's system is.
+   WHAT IT WRITES  DIR/report.html, or the name given to report_end_as: no script, no other file, no
+   network. Pictures are base64 PNG, plots inline SVG: lines, stacked areas or bars, linear or
+   logarithmic axes, round tick labels, a legend, points' values as tooltips, labels beside points.
+   Light or dark as the reader's system is; wide tables and plots scroll sideways on a phone.
 
    CONVENTIONS  All text is UTF-8 and escaped here. Values that are not finite, and values <= 0 on
    a logarithmic axis, break the line; how many were left out is said below the plot.
@@ -52,12 +53,32 @@ typedef struct report_error {
 
 typedef enum report_level { REPORT_INFO, REPORT_GOOD, REPORT_WARN, REPORT_BAD } report_level;
 
+typedef enum report_style {
+    REPORT_SOLID,
+    REPORT_DASHED,
+    REPORT_DOTTED,
+    REPORT_POINTS  // no line, dots only
+} report_style;
+
 // A named column. x NULL: 0, 1, 2, ...
 typedef struct report_series {
     const char *name;
     const double *x, *y;
     int count;
+    const char *const *label;  // beside the points, where there is room; NULL, or NULLs in it: none
+    report_style style;
+    int colour;  // 1 to 10; 0: the series' place among the others
 } report_series;
+
+// REPORT_INFO: no colour.
+typedef struct report_cell {
+    const char *text;
+    report_level level;
+} report_cell;
+
+typedef struct report_link {
+    const char *file, *text;  // file NULL: this page
+} report_link;
 
 typedef struct report_plot {
     const char *title, *x_label, *y_label;  // NULL: none
@@ -66,6 +87,7 @@ typedef struct report_plot {
     int stacked;  // areas on top of each other (same x; log_y is ignored)
     int markers;  // dots at the points
     int zero;     // a linear y axis starts at 0 (if nothing is negative)
+    int height;   // of a width of 720; 0: 300
 } report_plot;
 
 // subtitle may be NULL. NULL: no memory; every function then does nothing.
@@ -73,21 +95,45 @@ REPORT_API report *report_begin(const char *title, const char *subtitle);
 // A tile in the summary at the top.
 REPORT_API void report_status(report *r, const char *name, const char *value, report_level level);
 REPORT_API void report_heading(report *r, const char *text);
+// Links to headings of this page, by their text.
+REPORT_API void report_contents(report *r, const char *const *headings, int count);
 REPORT_API void report_text(report *r, const char *text);
+// A paragraph that stands out, with the colour of its level.
+REPORT_API void report_note(report *r, const char *text, report_level level);
+// Lines as they are: commands, comments of a file.
+REPORT_API void report_code(report *r, const char *text);
+// Other pages, at the top.
+REPORT_API void report_links(report *r, const report_link *links, int count);
+// What is added between the two stands side by side where the page is wide enough.
+REPORT_API void report_columns_begin(report *r);
+REPORT_API void report_columns_end(report *r);
 // Two columns; caption may be NULL.
 REPORT_API void report_table(report *r, const char *caption, const char *const *names,
                              const char *const *values, int rows);
+// A table of many columns under their heads; cells row after row. Columns of numbers (units may
+// follow) are aligned on the right. caption may be NULL.
+REPORT_API void report_grid(report *r, const char *caption, const char *const *heads,
+                            const report_cell *cells, int columns, int rows);
 // A film strip of at most `most` of the PNG files, first and last among them, evenly picked.
 // labels may be NULL, or have NULLs. A file that is missing or no PNG is an error (see top).
 REPORT_API void report_frames(report *r, const char *const *paths, const char *const *labels,
                               int count, int most);
+// All of the PNG files side by side, to be compared. As report_frames otherwise.
+REPORT_API void report_pictures(report *r, const char *const *paths, const char *const *labels,
+                                int count);
 REPORT_API report_plot report_plot_default(const char *title, const char *x_label,
                                            const char *y_label);
 // Arrays are read at once. More than 10 series share colours.
 REPORT_API void report_add_plot(report *r, const report_plot *plot, const report_series *series,
                                 int count);
+// A horizontal bar a name, made of the series' values side by side: series[k].y[i] is part k of bar
+// i. Of the plot title, x_label and note are used.
+REPORT_API void report_add_bars(report *r, const report_plot *plot, const char *const *names,
+                                const report_series *series, int count);
 // Writes directory/report.html and frees r. error may be NULL. 1, or 0 and a message.
 REPORT_API int report_end(report *r, const char *directory, report_error *error);
+REPORT_API int report_end_as(report *r, const char *directory, const char *file,
+                             report_error *error);
 
 #ifdef __cplusplus
 }
@@ -116,9 +162,9 @@ typedef struct report__text {
 } report__text;
 
 struct report {
-    report__text tiles, body;
+    report__text tiles, links, body;
     char *title, *subtitle;
-    int no_memory, frames;
+    int no_memory;
     char failure[512];
 };
 
@@ -149,18 +195,19 @@ static void report__put(report *r, report__text *t, const char *s) {
 }
 
 // Escaped for text and for quoted attributes; control characters, which HTML forbids, become
-// spaces.
+// spaces; no line breaks before a % sign.
 static void report__escape(report *r, report__text *t, const char *s) {
     for (; s && *s; s++) {
         char one[2] = {*s, 0};
         if ((unsigned char)*s < 32 || *s == 127) one[0] = ' ';
         report__put(r, t,
-                    *s == '<'    ? "&lt;"
-                    : *s == '>'  ? "&gt;"
-                    : *s == '&'  ? "&amp;"
-                    : *s == '"'  ? "&quot;"
-                    : *s == '\'' ? "&#39;"
-                                 : one);
+                    *s == ' ' && s[1] == '%' ? "\xc2\xa0"
+                    : *s == '<'              ? "&lt;"
+                    : *s == '>'              ? "&gt;"
+                    : *s == '&'              ? "&amp;"
+                    : *s == '"'              ? "&quot;"
+                    : *s == '\''             ? "&#39;"
+                                             : one);
     }
 }
 
@@ -194,6 +241,13 @@ static void report__number(double v, char text[40]) {
     snprintf(text, 40, "%.4g", fabs(v) < 1e-300 ? 0.0 : v);
     for (char *c = text; *c; c++)
         if (*c == ',') *c = '.';
+    // 1e-05 and 1e+06 as 1e-5 and 1e6
+    char *e = strchr(text, 'e');
+    if (!e) return;
+    char *from = e + 1, *to = e + 1;
+    if (*from == '-') to++;
+    from += strspn(from, "+-0");
+    memmove(to, from, strlen(from) + 1);
 }
 
 static char *report__copy(const char *s) {
@@ -271,19 +325,130 @@ report *report_begin(const char *title, const char *subtitle) {
     return r;
 }
 
-void report_status(report *r, const char *name, const char *value, report_level level) {
+static const char *report__level(report_level level) {
     static const char *const kind[] = {"info", "good", "warn", "bad"};
-    if (!r) return;
-    report__format(r, &r->tiles, "<div class=\"tile %r\"><dt>%s</dt><dd>%s</dd></div>\n",
-                   (unsigned)level < 4 ? kind[level] : kind[0], name, value);
+    return (unsigned)level < 4 ? kind[level] : kind[0];
+}
+
+void report_status(report *r, const char *name, const char *value, report_level level) {
+    if (r)
+        report__format(r, &r->tiles, "<div class=\"tile %r\"><dt>%s</dt><dd>%s</dd></div>\n",
+                       report__level(level), name, value);
+}
+
+// The name of a heading within the page: letters and digits, a dash for each other byte.
+static void report__anchor(const char *text, char name[64]) {
+    size_t n = 0;
+    for (; *text && n < 62; text++) {
+        int c = (unsigned char)*text;
+        int plain = (c >= '0' && c <= '9') || (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z');
+        name[n++] = (char)(plain || c == '_' ? c : '-');
+    }
+    name[n] = 0;
 }
 
 void report_heading(report *r, const char *text) {
-    if (r) report__format(r, &r->body, "<h2>%s</h2>\n", text);
+    char name[64];
+    report__anchor(text, name);
+    if (r) report__format(r, &r->body, "<h2 id=\"at-%s\">%s</h2>\n", name, text);
+}
+
+void report_contents(report *r, const char *const *headings, int count) {
+    char name[64];
+    if (!r || count <= 0) return;
+    report__put(r, &r->body, "<p class=\"contents\">");
+    for (int i = 0; i < count; i++) {
+        report__anchor(headings[i], name);
+        report__format(r, &r->body, "<a href=\"#at-%s\">%s</a>\n", name, headings[i]);
+    }
+    report__put(r, &r->body, "</p>\n");
 }
 
 void report_text(report *r, const char *text) {
     if (r) report__format(r, &r->body, "<p>%s</p>\n", text);
+}
+
+void report_note(report *r, const char *text, report_level level) {
+    if (r)
+        report__format(r, &r->body, "<p class=\"callout %r\">%s</p>\n", report__level(level), text);
+}
+
+// Line breaks stay; everything else is escaped.
+void report_code(report *r, const char *text) {
+    if (!r) return;
+    report__put(r, &r->body, "<pre>");
+    while (*text) {
+        char line[512];
+        size_t n = strcspn(text, "\n");
+        if (n > sizeof line - 1) n = sizeof line - 1;
+        memcpy(line, text, n), line[n] = 0;
+        report__escape(r, &r->body, line);
+        text += n;
+        if (*text == '\n') report__put(r, &r->body, "\n"), text++;
+    }
+    report__put(r, &r->body, "</pre>\n");
+}
+
+void report_links(report *r, const report_link *links, int count) {
+    for (int i = 0; r && i < count; i++)
+        if (links[i].file)
+            report__format(r, &r->links, "<a href=\"%s\">%s</a>\n", links[i].file, links[i].text);
+        else
+            report__format(r, &r->links, "<b>%s</b>\n", links[i].text);
+}
+
+void report_columns_begin(report *r) {
+    if (r) report__put(r, &r->body, "<div class=\"columns\">\n");
+}
+
+void report_columns_end(report *r) {
+    if (r) report__put(r, &r->body, "</div>\n");
+}
+
+// A digit first, after a sign or a comparison; or a dash for nothing.
+static int report__is_number(const char *s) {
+    if (!*s || !strcmp(s, "-") || !strcmp(s, "\xe2\x80\x93") || !strcmp(s, "nan")) return 1;
+    s += strspn(s, "<>=+-. ");
+    return *s >= '0' && *s <= '9';
+}
+
+static int report__is_numeric(const report_cell *cells, int column, int columns, int rows) {
+    int some = 0;
+    for (int i = 0; i < rows; i++) {
+        const char *s = cells[i * columns + column].text;
+        if (!s || !*s) continue;
+        if (!report__is_number(s)) return 0;
+        some = 1;
+    }
+    return some;
+}
+
+void report_grid(report *r, const char *caption, const char *const *heads, const report_cell *cells,
+                 int columns, int rows) {
+    if (!r || columns <= 0) return;
+    if (caption) report__format(r, &r->body, "<p class=\"caption\">%s</p>\n", caption);
+    // A focus for the keyboard, which scrolls it.
+    report__put(r, &r->body,
+                "<div class=\"scroll\" tabindex=\"0\"><table class=\"cells\">\n<thead><tr>");
+    int right[64] = {0};
+    for (int j = 0; j < columns; j++) {
+        if (j < 64) right[j] = report__is_numeric(cells, j, columns, rows);
+        report__format(r, &r->body, "<th scope=\"col\"%r>%s</th>",
+                       j < 64 && right[j] ? " class=\"n\"" : "", heads[j]);
+    }
+    report__put(r, &r->body, "</tr></thead>\n<tbody>\n");
+    for (int i = 0; i < rows; i++) {
+        report__put(r, &r->body, "<tr>");
+        for (int j = 0; j < columns; j++) {
+            const report_cell *c = &cells[i * columns + j];
+            report__format(r, &r->body, "<td class=\"%r %r\">%s</td>",
+                           j < 64 && right[j] ? "n" : "t",
+                           c->level == REPORT_INFO ? "plain" : report__level(c->level),
+                           c->text ? c->text : "");
+        }
+        report__put(r, &r->body, "</tr>\n");
+    }
+    report__put(r, &r->body, "</tbody></table></div>\n");
 }
 
 void report_table(report *r, const char *caption, const char *const *names,
@@ -323,6 +488,13 @@ void report_frames(report *r, const char *const *paths, const char *const *label
         long long at = n > 1 ? (2LL * k * (count - 1) + n - 1) / (2LL * (n - 1)) : count - 1;
         report__frame(r, paths[at], labels ? labels[at] : NULL);
     }
+    report__put(r, &r->body, "</div>\n");
+}
+
+void report_pictures(report *r, const char *const *paths, const char *const *labels, int count) {
+    if (!r || count <= 0) return;
+    report__put(r, &r->body, "<div class=\"film side\">\n");
+    for (int k = 0; k < count; k++) report__frame(r, paths[k], labels ? labels[k] : NULL);
     report__put(r, &r->body, "</div>\n");
 }
 
@@ -472,7 +644,8 @@ enum {
     REPORT__LEFT = 64,
     REPORT__RIGHT = 14,
     REPORT__TOP = 12,
-    REPORT__BOTTOM = 44
+    REPORT__BOTTOM = 44,
+    REPORT__BAR_LEFT = 205
 };
 
 report_plot report_plot_default(const char *title, const char *x_label, const char *y_label) {
@@ -482,12 +655,31 @@ report_plot report_plot_default(const char *title, const char *x_label, const ch
     return p;
 }
 
+// 2 to 9 times the powers of ten, where they are not too many to tell apart.
+static void report__minor(report *r, const report__axis *a, const report__axis *other,
+                          int vertical) {
+    if (!a->log || a->hi - a->lo > 5) return;
+    report__put(r, &r->body, "<path class=\"minor\" d=\"");
+    for (int e = (int)floor(a->lo); e <= (int)ceil(a->hi); e++)
+        for (int k = 2; k < 10; k++) {
+            double v = k * pow(10, e), at = report__pixel(a, v);
+            if (log10(v) < a->lo || log10(v) > a->hi) continue;
+            if (vertical)
+                report__format(r, &r->body, "M%f %fV%f", at, other->at_lo, other->at_hi);
+            else
+                report__format(r, &r->body, "M%f %fH%f", other->at_lo, at, other->at_hi);
+        }
+    report__put(r, &r->body, "\"/>\n");
+}
+
 static void report__grid(report *r, const report_plot *p, const report__axis *x,
                          const report__axis *y) {
     report__text *t = &r->body;
-    double tick[12];
+    double tick[12], foot = y->at_lo + (double)REPORT__BOTTOM;
     char text[40];
     int n = report__ticks(y, 6, tick);
+    report__minor(r, y, x, 0);
+    if (y->log) report__minor(r, x, y, 1);
     for (int i = 0; i < n; i++) {
         double at = report__pixel(y, tick[i]);
         report__number(tick[i], text);
@@ -508,7 +700,7 @@ static void report__grid(report *r, const report_plot *p, const report__axis *x,
     report__format(r, t, "<path class=\"axis\" d=\"M%f %fH%f\"/>\n", x->at_lo, y->at_lo, x->at_hi);
     if (p->x_label)
         report__format(r, t, "<text x=\"%f\" y=\"%f\" class=\"label\">%s</text>\n",
-                       0.5 * (x->at_lo + x->at_hi), (double)REPORT__H - 6, p->x_label);
+                       0.5 * (x->at_lo + x->at_hi), foot - 6, p->x_label);
     if (p->y_label)
         report__format(
             r, t, "<text transform=\"translate(13 %f) rotate(-90)\" class=\"label\">%s</text>\n",
@@ -518,19 +710,29 @@ static void report__grid(report *r, const report_plot *p, const report__axis *x,
 static void report__dot(report *r, const report_series *s, int i, int colour, double px,
                         double py) {
     char a[40], b[40];
+    const char *label = s->label ? s->label[i] : NULL;
     report__number(report__x(s, i), a);
     report__number(s->y[i], b);
     report__format(r, &r->body,
-                   "<circle class=\"dot c%d\" cx=\"%f\" cy=\"%f\" r=\"3.2\"><title>%s: %s, "
+                   "<circle class=\"dot c%d\" cx=\"%f\" cy=\"%f\" r=\"%r\"><title>%s%r%s: %s, "
                    "%s</title></circle>\n",
-                   colour, px, py, s->name, a, b);
+                   colour, px, py, s->style == REPORT_POINTS && !label ? "2.4" : "3.6", s->name,
+                   label ? " " : "", label ? label : "", a, b);
+}
+
+static int report__colour(const report_series *s, int k) {
+    return (s->colour > 0 ? s->colour - 1 : k) % 10;
+}
+
+static const char *report__dash(const report_series *s) {
+    return s->style == REPORT_DASHED ? " dashed" : s->style == REPORT_DOTTED ? " dotted" : "";
 }
 
 static void report__line(report *r, const report_plot *p, const report_series *s, int colour,
                          const report__axis *x, const report__axis *y) {
     int keep[REPORT__MOST + 2], n = report__thin(s, y, keep), down = 0, run = 0;
-    report__format(r, &r->body, "<path class=\"line c%d\" d=\"", colour);
-    for (int k = 0; k < n; k++) {
+    report__format(r, &r->body, "<path class=\"line c%d%r\" d=\"", colour, report__dash(s));
+    for (int k = 0; k < n && s->style != REPORT_POINTS; k++) {
         double a = report__x(s, keep[k]), b = s->y[keep[k]];
         int ok = report__usable(x, a) && report__usable(y, b);
         // A lone point between gaps is a line of no length: round caps make it a dot.
@@ -542,7 +744,7 @@ static void report__line(report *r, const report_plot *p, const report_series *s
     }
     if (run == 1) report__put(r, &r->body, "h0");
     report__put(r, &r->body, "\"/>\n");
-    for (int k = 0; k < n && p->markers; k++) {
+    for (int k = 0; k < n && (p->markers || s->style == REPORT_POINTS); k++) {
         double a = report__x(s, keep[k]), b = s->y[keep[k]];
         if (report__usable(x, a) && report__usable(y, b))
             report__dot(r, s, keep[k], colour, report__pixel(x, a), report__pixel(y, b));
@@ -554,7 +756,7 @@ static void report__areas(report *r, const report_series *s, int count, const re
                           const report__axis *y) {
     int n = report__shortest(s, count), groups = n < REPORT__MOST ? n : REPORT__MOST / 2;
     for (int k = count - 1; k >= 0 && groups > 0; k--) {
-        report__format(r, &r->body, "<path class=\"area c%d\" d=\"", k % 10);
+        report__format(r, &r->body, "<path class=\"area c%d\" d=\"", report__colour(&s[k], k));
         double first = 0, last = 0;
         int down = 0;
         for (int g = 0; g < groups; g++) {
@@ -575,11 +777,105 @@ static void report__areas(report *r, const report_series *s, int count, const re
     }
 }
 
+// Labels take, one after the other, the place around their dot that covers the least of the dots,
+// lines and labels that are there; one that would cover much of another label is left out (the
+// dot's tooltip has it).
+typedef struct report__box {
+    double x0, y0, x1, y1, weight;
+} report__box;
+
+enum { REPORT__BOXES = 1200 };
+
+typedef struct report__crowd {
+    report__box box[REPORT__BOXES];
+    int count;
+} report__crowd;
+
+static void report__stand(report__crowd *c, double x, double y, double w, double h, double weight) {
+    report__box b = {x - w / 2, y - h / 2, x + w / 2, y + h / 2, weight};
+    if (c->count < REPORT__BOXES) c->box[c->count++] = b;
+}
+
+static double report__covered(const report__box *a, const report__box *b) {
+    double w = fmin(a->x1, b->x1) - fmax(a->x0, b->x0), h = fmin(a->y1, b->y1) - fmax(a->y0, b->y0);
+    return w > 0 && h > 0 ? w * h : 0;
+}
+
+// Dots, and points along the lines.
+static void report__obstacles(report__crowd *c, const report_series *s, const report__axis *x,
+                              const report__axis *y) {
+    double px = 0, py = 0;
+    int down = 0;
+    for (int i = 0; i < s->count; i++) {
+        double a = report__x(s, i), b = s->y[i];
+        int ok = report__usable(x, a) && report__usable(y, b);
+        if (!ok) {
+            down = 0;
+            continue;
+        }
+        double qx = report__pixel(x, a), qy = report__pixel(y, b);
+        int n = down && s->style != REPORT_POINTS ? (int)(hypot(qx - px, qy - py) / 6) : 0;
+        for (int k = 1; k < n && n < 200; k++)
+            report__stand(c, px + (qx - px) * k / n, py + (qy - py) * k / n, 5, 5, 0.7);
+        report__stand(c, qx, qy, 9, 9, 2);
+        px = qx, py = qy, down = 1;
+    }
+}
+
+static double report__cost(const report__crowd *c, const report__box *b, const report__axis *x,
+                           const report__axis *y, double *labels) {
+    double area = (b->x1 - b->x0) * (b->y1 - b->y0), cost = 0;
+    report__box frame = {x->at_lo, y->at_hi, x->at_hi, y->at_lo, 0};
+    *labels = 0;
+    for (int i = 0; i < c->count; i++) {
+        double covered = report__covered(&c->box[i], b);
+        cost += covered * c->box[i].weight;
+        if (c->box[i].weight > 3) *labels += covered / area;
+    }
+    return cost + 8 * (area - report__covered(&frame, b));
+}
+
+static void report__label(report *r, report__crowd *c, const char *label, double px, double py,
+                          const report__axis *x, const report__axis *y) {
+    static const double side[8][2] = {{1, -.7}, {1, 0},    {1, .7}, {0, -1},
+                                      {0, 1},   {-1, -.7}, {-1, 0}, {-1, .7}};
+    double w = 3, h = 12, best = DBL_MAX, over = 0;
+    report__box at = {0, 0, 0, 0, 4};
+    for (const char *p = label; *p; p++) w += ((unsigned char)*p & 0xc0) != 0x80 ? 6.3 : 0;
+    for (int k = 0; k < 8; k++) {
+        double cx = px + side[k][0] * (w / 2 + 6), cy = py + side[k][1] * 13, on;
+        report__box b = {cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2, 4};
+        double cost = report__cost(c, &b, x, y, &on) + 2 * k;
+        if (cost < best) best = cost, at = b, over = on;
+    }
+    if (over > 0.3) return;
+    if (c->count < REPORT__BOXES) c->box[c->count++] = at;
+    report__format(r, &r->body, "<text class=\"at\" x=\"%f\" y=\"%f\">%s</text>\n", at.x0 + 1.5,
+                   at.y1 - 2, label);
+}
+
+static void report__labels(report *r, const report_series *s, int count, const report__axis *x,
+                           const report__axis *y) {
+    int some = 0;
+    for (int k = 0; k < count; k++) some |= s[k].label != NULL;
+    report__crowd *c = some ? (report__crowd *)calloc(1, sizeof *c) : NULL;
+    if (some && !c) r->no_memory = 1;
+    for (int k = 0; k < count && c; k++) report__obstacles(c, &s[k], x, y);
+    for (int k = 0; k < count && c; k++)
+        for (int i = 0; s[k].label && i < s[k].count; i++) {
+            double a = report__x(&s[k], i), b = s[k].y[i];
+            if (s[k].label[i] && report__usable(x, a) && report__usable(y, b))
+                report__label(r, c, s[k].label[i], report__pixel(x, a), report__pixel(y, b), x, y);
+        }
+    free(c);
+}
+
 static void report__legend(report *r, const report_plot *p, const report_series *s, int count,
                            int dropped) {
     report__put(r, &r->body, "<ul class=\"legend\">");
     for (int k = 0; k < count; k++)
-        report__format(r, &r->body, "<li><i class=\"c%d\"></i>%s</li>", k % 10, s[k].name);
+        report__format(r, &r->body, "<li><i class=\"c%d%r\"></i>%s</li>", report__colour(&s[k], k),
+                       report__dash(&s[k]), s[k].name);
     report__put(r, &r->body, "</ul>");
     if (p->note) report__format(r, &r->body, "<p class=\"note\">%s</p>", p->note);
     if (dropped)
@@ -592,19 +888,89 @@ void report_add_plot(report *r, const report_plot *plot, const report_series *se
     if (!r || count <= 0) return;
     report_plot p = *plot;
     report__axis x = {0, 0, REPORT__LEFT, REPORT__W - REPORT__RIGHT, p.log_x};
-    report__axis y = {0, 0, REPORT__H - REPORT__BOTTOM, REPORT__TOP, p.log_y && !p.stacked};
-    int dropped = 0;
+    int dropped = 0, height = p.height > 100 ? p.height : REPORT__H;
+    report__axis y = {0, 0, (double)(height - REPORT__BOTTOM), REPORT__TOP, p.log_y && !p.stacked};
     report__ranges(&p, series, count, &x, &y, &dropped);
     report__put(r, &r->body, "<figure class=\"plot\">");
     if (p.title) report__format(r, &r->body, "<figcaption>%s</figcaption>", p.title);
-    report__format(r, &r->body, "<svg viewBox=\"0 0 %d %d\" role=\"img\" aria-label=\"%s\">\n",
-                   REPORT__W, REPORT__H, p.title ? p.title : "plot");
+    report__format(
+        r, &r->body,
+        "<div class=\"scroll\"><svg viewBox=\"0 0 %d %d\" role=\"img\" aria-label=\"%s\">\n",
+        REPORT__W, height, p.title ? p.title : "plot");
     // Areas would hide the grid: it is drawn after them.
     if (p.stacked) report__areas(r, series, count, &x, &y);
     report__grid(r, &p, &x, &y);
-    for (int k = 0; k < count && !p.stacked; k++) report__line(r, &p, &series[k], k % 10, &x, &y);
-    report__put(r, &r->body, "</svg>");
+    for (int k = 0; k < count && !p.stacked; k++)
+        report__line(r, &p, &series[k], report__colour(&series[k], k), &x, &y);
+    if (!p.stacked) report__labels(r, series, count, &x, &y);
+    report__put(r, &r->body, "</svg></div>");
     report__legend(r, &p, series, count, dropped);
+    report__put(r, &r->body, "</figure>\n");
+}
+
+static double report__part(const report_series *s, int i) {
+    return i < s->count && s->y[i] - s->y[i] == 0 && s->y[i] > 0 ? s->y[i] : 0;
+}
+
+static void report__bar(report *r, const report_series *s, int count, int i, double y,
+                        const report__axis *x) {
+    double sum = 0;
+    char text[40];
+    for (int k = 0; k < count; k++) {
+        double v = report__part(&s[k], i), from = report__pixel(x, sum);
+        if (!(v > 0)) continue;
+        sum += v;
+        report__number(v, text);
+        report__format(r, &r->body,
+                       "<rect class=\"area c%d\" x=\"%f\" y=\"%f\" width=\"%f\" "
+                       "height=\"18\"><title>%s: %s</title></rect>\n",
+                       report__colour(&s[k], k), from, y, report__pixel(x, sum) - from, s[k].name,
+                       text);
+    }
+    snprintf(text, sizeof text, "%.3g", sum);
+    report__format(r, &r->body, "<text class=\"at\" x=\"%f\" y=\"%f\">%s</text>\n",
+                   report__pixel(x, sum) + 5, y + 13, text);
+}
+
+void report_add_bars(report *r, const report_plot *plot, const char *const *names,
+                     const report_series *series, int count) {
+    if (!r || count <= 0) return;
+    int bars = 0;
+    double most = 0, tick[12], bottom;
+    char text[40];
+    for (int k = 0; k < count; k++) bars = series[k].count > bars ? series[k].count : bars;
+    for (int i = 0; i < bars; i++) {
+        double sum = 0;
+        for (int k = 0; k < count; k++) sum += report__part(&series[k], i);
+        most = fmax(most, sum);
+    }
+    report__axis x = {0, most > 0 ? most : 1, REPORT__BAR_LEFT, REPORT__W - 60, 0};
+    bottom = 8.0 + 26 * bars;
+    report__put(r, &r->body, "<figure class=\"plot bars\">");
+    if (plot->title) report__format(r, &r->body, "<figcaption>%s</figcaption>", plot->title);
+    report__format(r, &r->body,
+                   "<div class=\"scroll\"><svg viewBox=\"0 0 %d %d\" role=\"img\" "
+                   "aria-label=\"%s\">\n",
+                   REPORT__W, (int)bottom + 42, plot->title ? plot->title : "bars");
+    int n = report__ticks(&x, 6, tick);
+    for (int i = 0; i < n; i++) {
+        report__number(tick[i], text);
+        report__format(r, &r->body,
+                       "<path class=\"grid\" d=\"M%f 4V%f\"/><text x=\"%f\" y=\"%f\" "
+                       "class=\"xtick\">%s</text>\n",
+                       report__pixel(&x, tick[i]), bottom, report__pixel(&x, tick[i]), bottom + 16,
+                       text);
+    }
+    for (int i = 0; i < bars; i++) {
+        report__format(r, &r->body, "<text x=\"%f\" y=\"%f\" class=\"ytick\">%s</text>\n",
+                       x.at_lo - 8, 26.0 * i + 21, names[i]);
+        report__bar(r, series, count, i, 26.0 * i + 8, &x);
+    }
+    if (plot->x_label)
+        report__format(r, &r->body, "<text x=\"%f\" y=\"%f\" class=\"label\">%s</text>\n",
+                       0.5 * (x.at_lo + x.at_hi), bottom + 36, plot->x_label);
+    report__put(r, &r->body, "</svg></div>");
+    report__legend(r, plot, series, count, 0);
     report__put(r, &r->body, "</figure>\n");
 }
 
@@ -662,12 +1028,34 @@ static const char *const report__style =
     ".axis,.tick{stroke:var(--soft);fill:none}.line{fill:none;stroke-width:1.8;stroke-linejoin:"
     "round;"
     "stroke-linecap:round}.area{stroke:var(--card);stroke-width:.7}.dot{stroke:var(--card);stroke-"
-    "width:1}\n"
+    "width:1}\n";
+
+static const char *const report__style_of_parts =
+    ".minor{stroke:var(--soft);stroke-opacity:.09;fill:none}.dashed{stroke-dasharray:7 5}"
+    ".dotted{stroke-dasharray:1 5}.plot .at{font-size:11.5px;fill:var(--ink);paint-order:stroke;"
+    "stroke:var(--card);stroke-width:3px;stroke-linejoin:round}.scroll{overflow-x:auto}\n"
     ".legend{list-style:none;display:flex;flex-wrap:wrap;gap:4px 18px;margin:6px 0 "
     "0;padding:0;font-size:13px}"
     ".legend "
     "i{display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px;vertical-"
     "align:-1px}"
+    ".legend i.dashed,.legend i.dotted{height:4px;vertical-align:3px;opacity:.75}\n"
+    "nav{display:flex;flex-wrap:wrap;gap:4px 22px;margin:12px 0 20px;padding-bottom:10px;"
+    "border-bottom:1px solid var(--rule)}.contents{display:flex;flex-wrap:wrap;gap:4px "
+    "18px;max-width:none}a{color:var(--info)}\n"
+    ".callout{background:var(--card);border:1px solid var(--rule);border-left:4px solid "
+    "var(--info);border-radius:6px;padding:10px 14px;margin:12px 0;max-width:none}"
+    ".callout.good{border-left-color:var(--good)}.callout.warn{border-left-color:var(--warn)}"
+    ".callout.bad{border-left-color:var(--bad)}\n"
+    "pre{font:12.5px/1.5 ui-monospace,Menlo,Consolas,monospace;white-space:pre-wrap;overflow-wrap:"
+    "anywhere;background:var(--card);border:1px solid var(--rule);border-radius:6px;padding:8px "
+    "12px;margin:10px 0;color:var(--soft)}\n"
+    ".columns{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(500px,100%),1fr));gap:"
+    "0 18px}.columns>*{min-width:0}.columns .plot{margin:9px 0}.columns .plot text{font-size:14px}"
+    ".columns .plot .at{font-size:13px}\n"
+    ".bars svg{max-width:860px}\n"
+    ".side{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(240px,100%),1fr));"
+    "overflow:visible}\n"
     ".note{color:var(--soft);font-size:13px;margin:4px 0 0}\n"
     "table{border-collapse:collapse;margin:12px 0;background:var(--card);border:1px solid "
     "var(--rule)}"
@@ -676,7 +1064,25 @@ static const char *const report__style =
     "border-bottom:1px solid "
     "var(--rule);font-weight:400;overflow-wrap:anywhere}th{color:var(--soft)}"
     "td{font-variant-numeric:tabular-nums}\n"
-    "@media print{.film{flex-wrap:wrap;overflow:visible}.film figure{flex-basis:48%}}\n";
+    ".caption{font-weight:600;margin:18px 0 6px}.cells{margin:0;font-size:14px;min-width:100%}"
+    ".cells th{font-size:13px;line-height:1.3;vertical-align:bottom;background:var(--card)}.cells "
+    "td,.cells "
+    "th{padding:4px 10px;overflow-wrap:normal}.cells .n{text-align:right}.cells "
+    "td.n{white-space:nowrap}"
+    ".cells td.t:first-child{min-width:14em}.cells td.t:last-child{min-width:8em}"
+    ".cells tbody tr:last-child td{border-bottom:0}.cells .good{color:var(--good);font-weight:600}"
+    ".cells .warn{color:var(--warn);font-weight:600}.cells .bad{color:var(--bad);font-weight:600}"
+    ".scroll{margin:4px 0}.cells+*{margin-top:10px}\n"
+    "@media(max-width:640px){body{padding:20px 14px "
+    "40px}h1{font-size:23px}.plot{padding:10px}.plot text,.columns .plot text{font-size:19px}.plot "
+    ".at,.columns .plot .at{font-size:16px}.bars svg{min-width:480px}.bars.plot text,.bars.plot "
+    ".at{font-size:14px}.cells td,.cells th{padding:4px 8px}.cells "
+    "td.t:first-child{min-width:8em}}\n@media "
+    "print{body{max-width:none;padding:0;background:#fff}.columns{grid-template-columns:1fr "
+    "1fr}.columns .plot text{font-size:17px}.film{flex-wrap:wrap;overflow:visible}.film "
+    "figure{flex-basis:48%}.scroll{overflow:visible}.cells{font-size:9.5px}.cells th{font-size:"
+    "9.5px}.cells td,.cells th{padding:2px 5px}figure,.callout,tr{break-inside:avoid}h2{break-"
+    "after:avoid}nav,.contents{display:none}}\n";
 
 static void report__head(report *r, report__text *t) {
     report__format(r, t,
@@ -685,6 +1091,7 @@ static void report__head(report *r, report__text *t) {
                    "<title>%s</title>\n<style>\n",
                    r->title);
     report__put(r, t, report__style);
+    report__put(r, t, report__style_of_parts);
     for (int i = 0; i < 10; i++)
         report__format(r, t,
                        ".line.c%d{stroke:var(--c%d)}.area.c%d,.dot.c%d{fill:var(--c%d)}i.c%d{"
@@ -692,18 +1099,20 @@ static void report__head(report *r, report__text *t) {
                        i, i, i, i, i, i, i);
     report__format(r, t, "</style>\n</head>\n<body>\n<h1>%s</h1>\n", r->title);
     if (r->subtitle[0]) report__format(r, t, "<p class=\"sub\">%s</p>\n", r->subtitle);
+    if (r->links.size) report__format(r, t, "<nav>\n%r</nav>\n", r->links.at);
     if (r->tiles.size) report__format(r, t, "<dl class=\"tiles\">\n%r</dl>\n", r->tiles.at);
 }
 
 // To a temporary name, then renamed: a reader sees the old page or the new one.
-static int report__write(report *r, const report__text *head, const char *directory) {
+static int report__write(report *r, const report__text *head, const char *directory,
+                         const char *file) {
     static const char end[] = "</body>\n</html>\n";
     char path[1024], temporary[1040];
-    if (strlen(directory) > sizeof path - 32) {
+    int fits = snprintf(path, sizeof path, "%s/%s", directory, file);
+    if (fits < 0 || fits > (int)sizeof path - 32) {
         report__fail(r, directory, "the name is too long");
         return 0;
     }
-    snprintf(path, sizeof path, "%s/report.html", directory);
     snprintf(temporary, sizeof temporary, "%s.part", path);
     FILE *f = fopen(temporary, "wb");
     if (!f) {
@@ -723,22 +1132,27 @@ static int report__write(report *r, const report__text *head, const char *direct
     return ok;
 }
 
-int report_end(report *r, const char *directory, report_error *error) {
+int report_end_as(report *r, const char *directory, const char *file, report_error *error) {
     report__text head = {NULL, 0, 0};
     if (error) error->message[0] = 0;
     if (r && !r->no_memory) report__head(r, &head);
     if (r && r->no_memory)
-        snprintf(r->failure, sizeof r->failure, "%.400s/report.html: no memory", directory);
+        snprintf(r->failure, sizeof r->failure, "%.350s/%.100s: no memory", directory, file);
     else if (r)
-        report__write(r, &head, directory);
+        report__write(r, &head, directory, file);
     int ok = r && !r->failure[0];
     if (error && !ok)
-        snprintf(error->message, sizeof error->message, "%s",
-                 r ? r->failure : "report.html: no memory");
+        snprintf(error->message, sizeof error->message, "%.400s%s", r ? r->failure : file,
+                 r ? "" : ": no memory");
     free(head.at);
-    if (r) free(r->tiles.at), free(r->body.at), free(r->title), free(r->subtitle);
+    if (r)
+        free(r->tiles.at), free(r->links.at), free(r->body.at), free(r->title), free(r->subtitle);
     free(r);
     return ok;
+}
+
+int report_end(report *r, const char *directory, report_error *error) {
+    return report_end_as(r, directory, "report.html", error);
 }
 
 #ifdef __cplusplus

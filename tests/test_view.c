@@ -12,6 +12,7 @@
 #include "../examples/view.h"
 #define REPORT_IMPLEMENTATION
 #include "../examples/report.h"
+#include "page.h"
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -357,16 +358,6 @@ static void test_text_and_images(void **state) {
 
 // ---------------------------------------------------------------------------------------------
 
-static char *slurp(const char *path) {
-    FILE *f = fopen(path, "rb");
-    assert_non_null(f);
-    char *s = (char *)calloc(1, 1 << 22);
-    assert_non_null(s);
-    assert_true(fread(s, 1, (1 << 22) - 1, f) > 0);
-    fclose(f);
-    return s;
-}
-
 static view_image noise(void) {
     view_image im = view_image_alloc(37, 23);
     unsigned seed = 7;
@@ -429,42 +420,6 @@ static void test_unwritable(void **state) {
     assert_false(report_end(NULL, ".", &r));
 }
 
-// Tags open and close in order, attributes are quoted, no stray < or &.
-static void check_tags(const char *s) {
-    char stack[64][16];
-    int depth = 0, elements = 0;
-    s = strstr(s, "<html");
-    for (; *s; s++) {
-        if (*s == '&')
-            assert_true(strspn(s + 1, "#abcdefghijklmnopqrstuvwxyz0123456789") < 6 &&
-                        strchr(s, ';') - s < 7);
-        assert_true(*s != '>');
-        if (*s != '<') continue;
-        int closing = *++s == '/', n = 0;
-        s += closing;
-        char name[16] = {0};
-        for (; (*s >= 'a' && *s <= 'z') || (*s >= '0' && *s <= '9'); s++)
-            assert_true(n < 15), name[n++] = *s;
-        assert_true(n > 0);
-        for (int quoted = 0; *s && (quoted || *s != '>'); s++) {
-            if (*s == '"') quoted = !quoted;
-            assert_true(*s != '<' && (quoted || *s != '\''));
-        }
-        elements++;
-        if (closing) {
-            assert_true(depth > 0);
-            assert_string_equal(stack[--depth], name);
-        } else if (s[-1] != '/' && strcmp(name, "meta") && strcmp(name, "img") &&
-                   strcmp(name, "input")) {
-            assert_true(depth < 64);
-            strcpy(stack[depth++], name);
-        }
-        if (!closing && !strcmp(name, "style")) s = strstr(s, "</style>") - 1;
-    }
-    assert_int_equal(depth, 0);
-    assert_true(elements > 20);
-}
-
 static void test_report(void **state) {
     (void)state;
     enum { N = 2000 };
@@ -478,13 +433,16 @@ static void test_report(void **state) {
     report_heading(r, "Head <1>"), report_text(r, "a < b & c > d");
     const char *names[2] = {"dt", "file"}, *values[2] = {"0.01 s", "a\"b\"<c>&.msh"};
     report_table(r, "Scene & more", names, values, 2);
-    report_series s[3] = {{"one <a>", t, a, N}, {"two & b", t, b, N}, {"gap", NULL, gap, N}};
+    report_series s[3] = {{"one <a>", t, a, N, NULL, REPORT_SOLID, 0},
+                          {"two & b", t, b, N, NULL, REPORT_SOLID, 0},
+                          {"gap", NULL, gap, N, NULL, REPORT_SOLID, 0}};
     report_plot p = report_plot_default("lines <&>", "time, s", "n"), q = p, l = p;
     q.stacked = 1, l.log_y = 1, l.markers = 1, l.note = "a note";
     report_add_plot(r, &p, s, 2), report_add_plot(r, &q, s, 2), report_add_plot(r, &l, s + 2, 1);
     double none[2] = {NAN, NAN}, one[1] = {3};
-    report_series empty = {"none", NULL, none, 2}, single = {"one", NULL, one, 1},
-                  zero = {"zero", NULL, NULL, 0};
+    report_series empty = {"none", NULL, none, 2, NULL, REPORT_SOLID, 0},
+                  single = {"one", NULL, one, 1, NULL, REPORT_SOLID, 0},
+                  zero = {"zero", NULL, NULL, 0, NULL, REPORT_SOLID, 0};
     report_add_plot(r, &p, &empty, 1), report_add_plot(r, &p, &single, 1),
         report_add_plot(r, &p, &zero, 1);
     report_add_plot(r, &l, &empty, 1), report_add_plot(r, &q, &zero, 1);

@@ -1,0 +1,564 @@
+/* report.c: the pages of `make report`
+
+   report [-o OUT] RESULTS_DIR OUT_DIR
+
+   Writes OUT/index.html (error against run time), OUT/stability.html and OUT/leave_out.html; OUT is
+   OUT_DIR unless given. RESULTS_DIR holds the committed large measurements (bench/results), OUT_DIR
+   the small rerun: error_vs_time.csv, error_steps.csv and SCENE_*.png in either; stability.csv,
+   stiffness.csv and leave_out.csv in OUT_DIR, or else in RESULTS_DIR. Of a file that is not there
+   the page says which command makes it. A file that is broken is named with its line, on the page
+   and on stderr, and the exit code is 1; the other parts are written all the same.
+
+   Another page is a function and a row in `pages`; the links among the pages follow. */
+#define REPORT_IMPLEMENTATION
+#include "../examples/report.h"
+#define CURVES_IMPLEMENTATION
+#include "../examples/curves.h"
+
+typedef struct source {
+    const char *results, *out;
+    int failed;
+} source;
+
+static const char *join(char path[700], const char *folder, const char *file) {
+    snprintf(path, 700, "%.500s/%.150s", folder, file);
+    return path;
+}
+
+static void complain(source *s, report *r, const char *message) {
+    fprintf(stderr, "report: %s\n", message);
+    report_note(r, message, REPORT_BAD);
+    s->failed = 1;
+}
+
+static void missing(report *r, const char *what, const char *command) {
+    char text[200];
+    snprintf(text, sizeof text, "%.100s: not there. This command makes it:", what);
+    report_text(r, text);
+    report_code(r, command);
+}
+
+// A table of OUT_DIR, or else of RESULTS_DIR. 1, or 0 and the page says why.
+static int open_table(source *s, report *r, const char *file, const char *header,
+                      const char *command, curves_table *t, char path[700]) {
+    curves_error why;
+    if (!curves__there(join(path, s->out, file)) && !curves__there(join(path, s->results, file))) {
+        missing(r, file, command);
+        return 0;
+    }
+    if (curves_table_read(t, path, header, &why)) return 1;
+    complain(s, r, why.message);
+    return 0;
+}
+
+// A cell's number; NAN where it is empty or a word.
+static double number(const curves_table *t, int row, int column) {
+    char *end = NULL;
+    const char *s = curves_cell(t, row, column);
+    double v = strtod(s, &end);
+    return *s && !*end ? v : NAN;
+}
+
+// 1040350780 as 1 040 350 780, with narrow spaces that do not break.
+static void grouped(const char *digits, char text[64]) {
+    size_t n = strlen(digits), used = 0;
+    for (size_t i = 0; i < n && used < 56; i++) {
+        if (i > 0 && (n - i) % 3 == 0) memcpy(text + used, "\xe2\x80\xaf", 3), used += 3;
+        text[used++] = digits[i];
+    }
+    text[used] = 0;
+}
+
+// As written where that is short, or else grouped or to four digits.
+static const char *shown(const curves_table *t, int row, int column, char text[64]) {
+    const char *s = curves_cell(t, row, column);
+    double v = number(t, row, column);
+    if (v != v) return s;
+    if (strlen(s) > 4 && strlen(s) < 20 && strspn(s, "0123456789") == strlen(s))
+        grouped(s, text);
+    else if (fabs(v) > 0 && fabs(v) < 1e-4)
+        curves__g(v, text);
+    else if (strlen(s) > 6)
+        snprintf(text, 64, "%.4g", v);
+    else
+        return s;
+    return text;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>index
+// ---------------------------------------------------------------------------------------------
+
+// 1: read, 0: not there, -1: broken.
+static int read_curves(source *s, report *r, const char *folder, curves *c) {
+    char rows[700], steps[700];
+    curves_error why;
+    join(rows, folder, "error_vs_time.csv"), join(steps, folder, "error_steps.csv");
+    if (!curves__there(rows)) return 0;
+    if (curves_read(c, rows, curves__there(steps) ? steps : NULL, &why)) return 1;
+    complain(s, r, why.message);
+    return -1;
+}
+
+static int scene_of(const curves *c, const char *name) {
+    for (int k = 0; k < c->scenes; k++)
+        if (!strcmp(c->scene[k], name)) return k;
+    return -1;
+}
+
+// The large measurement and the small rerun of one scene.
+static void both(report *r, const source *s, const curves *large, int a, const curves *small,
+                 int b) {
+    static const curves_measure m[2] = {CURVES_MAX, CURVES_FINAL};
+    static const char *const title[2] = {"Largest error of a step",
+                                         "Distance at the end of the free trajectory"};
+    char text[120];
+    curves_draw_verdict(r, large, a, CURVES_MAX, "Large, largest error of a step");
+    curves_draw_verdict(r, large, a, CURVES_FINAL, "Large, distance at the end");
+    curves_draw_verdict(r, small, b, CURVES_MAX, "Small rerun, largest error of a step");
+    report_columns_begin(r);
+    for (int k = 0; k < 2; k++) {
+        snprintf(text, sizeof text, "%s: large", title[k]);
+        curves_draw_errors(r, large, a, m[k], text);
+        snprintf(text, sizeof text, "%s: small rerun", title[k]);
+        curves_draw_errors(r, small, b, m[k], text);
+    }
+    report_columns_end(r);
+    curves_draw_pictures(r, large, a, s->results);
+    curves_draw_pictures(r, small, b, s->out);
+    curves_draw_advice(r, large, a);
+    curves_draw_steps(r, large, a);
+}
+
+static const char *small_heading(const curves *small, int scene, char text[200]) {
+    snprintf(text, 200, "%.150s, small", small->scene[scene]);
+    return text;
+}
+
+static void draw_scenes(report *r, const source *s, const curves *large, const curves *small) {
+    for (int k = 0; k < large->scenes; k++) {
+        int b = scene_of(small, large->scene[k]);
+        report_heading(r, large->scene[k]);
+        if (b >= 0)
+            both(r, s, large, k, small, b);
+        else
+            curves_draw_scene(r, large, k, s->results);
+    }
+    for (int k = 0; k < small->scenes; k++) {
+        char text[200];
+        if (scene_of(large, small->scene[k]) >= 0) continue;
+        report_heading(r, small_heading(small, k, text));
+        curves_draw_scene(r, small, k, s->out);
+    }
+}
+
+// Links to the headings of draw_scenes.
+static void draw_contents(report *r, const curves *large, const curves *small) {
+    size_t most = (size_t)(large->scenes + small->scenes) + 1;
+    const char **heading = (const char **)calloc(most, sizeof *heading);
+    char(*text)[200] = (char(*)[200])calloc(most, sizeof *text);
+    int n = 0;
+    for (int k = 0; heading && text && k < large->scenes; k++) heading[n++] = large->scene[k];
+    for (int k = 0; heading && text && k < small->scenes; k++)
+        if (scene_of(large, small->scene[k]) < 0)
+            heading[n] = small_heading(small, k, text[n]), n++;
+    if (n > 1) report_contents(r, heading, n);
+    free((void *)heading), free(text);
+}
+
+static void page_index(source *s, report *r) {
+    curves large, small;
+    memset(&large, 0, sizeof large), memset(&small, 0, sizeof small);
+    int same = !strcmp(s->results, s->out);
+    int a = same ? 0 : read_curves(s, r, s->results, &large), b = read_curves(s, r, s->out, &small);
+    curves_draw_tiles(r, a > 0 ? &large : &small);
+    report_text(
+        r,
+        "The same steps by the subspace alone, by the adaptive subspace and by full-space "
+        "solvers, each over its tolerance: how far the result is from a tight full-space "
+        "solution, and how long it took. Lower left is better. A step's error is the "
+        "largest distance of a node from that solution, over the largest displacement of the "
+        "step.");
+    report_heading(r, "Large measurements");
+    if (a > 0) curves_draw_summary(r, &large), curves_draw_comment(r, &large);
+    if (a == 0 && !same) missing(r, "Large measurements (error_vs_time.csv)", "make bench-error");
+    report_heading(r, "Small rerun on this machine");
+    if (b > 0) curves_draw_summary(r, &small), curves_draw_comment(r, &small);
+    if (b == 0) missing(r, "Small rerun (error_vs_time.csv)", "make report");
+    if (a > 0 || b > 0) curves_draw_key(r);
+    draw_contents(r, &large, &small);
+    draw_scenes(r, s, &large, &small);
+    curves_free(&large), curves_free(&small);
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>stability
+// ---------------------------------------------------------------------------------------------
+
+enum { CASE, MODE, STEPS, STATUS, NEWTON_MEDIAN, NEWTON_MAX, LINEAR_MAX, MIN_J, MIN_DISTANCE };
+enum { PATH_OK = MIN_DISTANCE + 1, FINITE, ENERGY_DRIFT, MOMENTUM_DRIFT, SECONDS, STABILITY };
+
+static const char *const stability_header =
+    "case,mode,steps,status,newton_median,newton_max,linear_max,min_J,min_distance,path_ok,finite,"
+    "energy_drift,momentum_drift,seconds";
+
+// A solver's own words for an end short of its tolerance are honest; other words are failures.
+static report_level status_level(const char *status) {
+    static const char *const honest[] = {"iterations", "budget", "stalled", "targets", "linear"};
+    if (!strncmp(status, "converged", 9)) return REPORT_GOOD;
+    for (int k = 0; k < 5; k++)
+        if (!strncmp(status, honest[k], strlen(honest[k]))) return REPORT_WARN;
+    return REPORT_BAD;
+}
+
+static report_level yes_level(const char *s) {
+    static const char *const yes[] = {"1", "yes", "ok", "true"}, *const none[] = {"", "-", "n/a"};
+    for (int k = 0; k < 4; k++)
+        if (!strcmp(s, yes[k])) return REPORT_GOOD;
+    for (int k = 0; k < 3; k++)
+        if (!strcmp(s, none[k])) return REPORT_INFO;
+    return REPORT_BAD;
+}
+
+static report_level stability_level(const curves_table *t, int row, int column) {
+    const char *s = curves_cell(t, row, column);
+    double v = number(t, row, column);
+    if (column == STATUS) return status_level(s);
+    if (column == PATH_OK || column == FINITE) return yes_level(s);
+    if (column == MIN_DISTANCE) return v <= 0 ? REPORT_BAD : REPORT_INFO;
+    if (column == MIN_J) return v <= 0 ? REPORT_WARN : REPORT_INFO;
+    return REPORT_INFO;
+}
+
+static void stability_tiles(report *r, const curves_table *t) {
+    int converged = 0, honest = 0, path = 0, finite = 0;
+    char text[80];
+    for (int i = 0; i < t->rows; i++) {
+        report_level level = stability_level(t, i, STATUS);
+        converged += level == REPORT_GOOD, honest += level == REPORT_WARN;
+        path += stability_level(t, i, PATH_OK) == REPORT_BAD;
+        finite += stability_level(t, i, FINITE) == REPORT_BAD;
+    }
+    int failed = t->rows - converged - honest;
+    snprintf(text, sizeof text, "%d of %d runs", converged, t->rows);
+    report_status(r, "Tolerance met", text, converged == t->rows ? REPORT_GOOD : REPORT_WARN);
+    snprintf(text, sizeof text, "%d", honest);
+    report_status(r, "Stopped short and said so", text, honest ? REPORT_WARN : REPORT_GOOD);
+    snprintf(text, sizeof text, "%d", failed);
+    report_status(r, "Failed otherwise", text, failed ? REPORT_BAD : REPORT_GOOD);
+    snprintf(text, sizeof text, "%d", path);
+    report_status(r, "Intersections or inversions", text, path ? REPORT_BAD : REPORT_GOOD);
+    snprintf(text, sizeof text, "%d", finite);
+    report_status(r, "Numbers that are not finite", text, finite ? REPORT_BAD : REPORT_GOOD);
+}
+
+static void stability_faults(report *r, const curves_table *t) {
+    for (int i = 0; i < t->rows; i++) {
+        char text[400];
+        int path = stability_level(t, i, PATH_OK) == REPORT_BAD;
+        int finite = stability_level(t, i, FINITE) == REPORT_BAD;
+        int status = stability_level(t, i, STATUS) == REPORT_BAD;
+        if (!path && !finite && !status) continue;
+        snprintf(text, sizeof text, "%.120s, %.40s:%s%s%s%.60s", curves_cell(t, i, CASE),
+                 curves_cell(t, i, MODE), path ? " the path is not free of intersections." : "",
+                 finite ? " a number is not finite." : "", status ? " status " : "",
+                 status ? curves_cell(t, i, STATUS) : "");
+        report_note(r, text, REPORT_BAD);
+    }
+}
+
+static void grid_of(report *r, const curves_table *t, const char *caption, const char *const *heads,
+                    report_level (*level)(const curves_table *, int, int)) {
+    size_t n = (size_t)t->rows * (size_t)t->columns;
+    report_cell *cell = (report_cell *)calloc(n + 1, sizeof *cell);
+    char(*text)[64] = (char(*)[64])calloc(n + 1, sizeof *text);
+    for (int i = 0; cell && text && i < t->rows; i++)
+        for (int j = 0; j < t->columns; j++) {
+            size_t k = (size_t)i * (size_t)t->columns + (size_t)j;
+            cell[k].text = shown(t, i, j, text[k]), cell[k].level = level(t, i, j);
+            if (level == stability_level && (j == PATH_OK || j == FINITE))
+                cell[k].text = cell[k].level == REPORT_GOOD  ? "yes"
+                               : cell[k].level == REPORT_BAD ? "no"
+                                                             : "\xe2\x80\x93";
+        }
+    if (cell && text) report_grid(r, caption, heads, cell, t->columns, t->rows);
+    free(cell), free(text);
+}
+
+static void draw_stability(source *s, report *r) {
+    static const char *const heads[STABILITY] = {
+        "case",        "mode",         "steps",          "status",       "Newton, median",
+        "Newton, max", "linear, max",  "min J",          "min distance", "path ok",
+        "finite",      "energy drift", "momentum drift", "seconds"};
+    char path[700];
+    curves_table t;
+    if (!open_table(s, r, "stability.csv", stability_header, "sh bench/stability.sh out/report", &t,
+                    path))
+        return;
+    stability_tiles(r, &t);
+    report_text(r,
+                "Each case in full space, adaptive, and in the subspace alone. Every run must end "
+                "without intersection, inversion or a number that is not finite, and with its "
+                "tolerance met or a status that says it is not.");
+    if (*t.comment) report_code(r, t.comment);
+    stability_faults(r, &t);
+    grid_of(r, &t, NULL, heads, stability_level);
+    curves_table_free(&t);
+}
+
+enum { YOUNG, SOLVER, NEWTON, ITERATIONS, LINEAR_SECONDS, TOTAL_SECONDS, STIFFNESS_STATUS };
+enum { SOLVERS = 8 };
+
+static const char *const stiffness_header =
+    "E,solver,newton,linear_iters,linear_seconds,total_seconds,status";
+
+static int solvers_of(const curves_table *t, const char **name) {
+    int n = 0;
+    for (int i = 0; i < t->rows; i++) {
+        int k = 0;
+        while (k < n && strcmp(name[k], curves_cell(t, i, SOLVER)) != 0) k++;
+        if (k == n && n < SOLVERS) name[n++] = curves_cell(t, i, SOLVER);
+    }
+    return n;
+}
+
+static void stiffness_plot(report *r, const curves_table *t, int column, const char *title,
+                           const char *unit) {
+    const char *name[SOLVERS];
+    double *x = (double *)calloc(2 * (size_t)t->rows + 1, sizeof *x), *y = x ? x + t->rows : NULL;
+    report_series s[SOLVERS];
+    memset(s, 0, sizeof s);
+    int solvers = solvers_of(t, name), series = 0, used = 0;
+    for (int k = 0; x && k < solvers; k++) {
+        int first = used, some = 0;
+        for (int i = 0; i < t->rows; i++)
+            if (!strcmp(name[k], curves_cell(t, i, SOLVER))) {
+                x[used] = number(t, i, YOUNG), y[used] = number(t, i, column);
+                some |= y[used++] > 0;
+            }
+        if (!some) continue;  // a direct solver has no iterations
+        s[series].name = name[k], s[series].x = x + first, s[series].y = y + first;
+        s[series].style = strcmp(name[k], "adaptive") ? REPORT_DASHED : REPORT_SOLID;
+        s[series].count = used - first, s[series].colour = k + 1, series++;
+    }
+    report_plot p = report_plot_default(title, "E, Pa", unit);
+    p.log_x = p.log_y = p.markers = 1;
+    report_add_plot(r, &p, s, series);
+    free(x);
+}
+
+static int stiffness_row(const curves_table *t, double E, const char *solver) {
+    for (int i = 0; i < t->rows; i++)
+        if (!strcmp(curves_cell(t, i, SOLVER), solver) && number(t, i, YOUNG) == E) return i;
+    return -1;
+}
+
+// The two promises for 1e4 to 1e12 Pa. A direct solve of no iterations counts as one.
+typedef struct stiffness_check {
+    double growth, growth_at, time, time_at, from, to;  // worst ratios and their E; NAN: no data
+} stiffness_check;
+
+static stiffness_check check_stiffness(const curves_table *t) {
+    stiffness_check c = {NAN, NAN, NAN, NAN, INFINITY, 0};
+    double first = NAN;
+    for (int i = 0; i < t->rows; i++) {
+        double E = number(t, i, YOUNG);
+        if (strcmp(curves_cell(t, i, SOLVER), "adaptive") != 0) continue;
+        if (!(E >= 0.999e4 && E <= 1.001e12)) continue;
+        c.to = fmax(c.to, E);
+        if (E < c.from) c.from = E, first = fmax(number(t, i, ITERATIONS), 1);
+    }
+    for (int i = 0; i < t->rows; i++) {
+        double E = number(t, i, YOUNG);
+        if (strcmp(curves_cell(t, i, SOLVER), "adaptive") != 0) continue;
+        if (!(E >= c.from && E <= c.to)) continue;
+        double growth = fmax(number(t, i, ITERATIONS), 1) / first;
+        if (!(growth <= c.growth)) c.growth = growth, c.growth_at = E;
+        int direct = stiffness_row(t, E, "direct");
+        double time =
+            direct < 0 ? NAN : number(t, i, LINEAR_SECONDS) / number(t, direct, LINEAR_SECONDS);
+        if (curves__finite(time) && !(time <= c.time)) c.time = time, c.time_at = E;
+    }
+    return c;
+}
+
+static void stiffness_verdict(report *r, const curves_table *t) {
+    stiffness_check c = check_stiffness(t);
+    char text[400] = "", a[32], b[32];
+    if (c.growth != c.growth) {
+        report_note(r, "No rows of `adaptive` from 1e4 to 1e12 Pa.", REPORT_WARN);
+        return;
+    }
+    int wide = c.from <= 1.001e4 && c.to >= 0.999e12;
+    snprintf(
+        text, sizeof text,
+        "Iterations of adaptive: at most %.2f times those at %s Pa (at %s Pa); the bound is 5.%s",
+        c.growth, curves__g(c.from, a), curves__g(c.growth_at, b),
+        wide ? "" : " Not all of 1e4 to 1e12 Pa was measured.");
+    report_note(r, text, c.growth > 5 ? REPORT_BAD : wide ? REPORT_GOOD : REPORT_WARN);
+    if (c.time == c.time)
+        snprintf(
+            text, sizeof text,
+            "Linear-solve time of adaptive: at most %.2f times the direct solver's (at %s Pa); "
+            "the bound is 1.10.",
+            c.time, curves__g(c.time_at, a));
+    else
+        snprintf(text, sizeof text, "Linear-solve time: no rows of `direct` to compare with.");
+    report_note(r, text, c.time > 1.1 ? REPORT_BAD : c.time == c.time ? REPORT_GOOD : REPORT_WARN);
+}
+
+static report_level stiffness_level(const curves_table *t, int row, int column) {
+    return column == STIFFNESS_STATUS ? status_level(curves_cell(t, row, column)) : REPORT_INFO;
+}
+
+static void draw_stiffness(source *s, report *r) {
+    static const char *const heads[7] = {
+        "E, Pa",           "solver",   "Newton iterates", "linear iterations",
+        "linear solve, s", "total, s", "status"};
+    char path[700];
+    curves_table t;
+    report_heading(r, "Stiffness: a hand on spikes, E from 100 Pa to 1 TPa");
+    if (!open_table(s, r, "stiffness.csv", stiffness_header, "sh bench/stability.sh out/report", &t,
+                    path))
+        return;
+    stiffness_verdict(r, &t);
+    report_columns_begin(r);
+    stiffness_plot(r, &t, ITERATIONS, "Iterations of the linear solver", "iterations");
+    stiffness_plot(r, &t, LINEAR_SECONDS, "Time of the linear solves", "seconds");
+    stiffness_plot(r, &t, NEWTON, "Newton iterates", "iterates");
+    stiffness_plot(r, &t, TOTAL_SECONDS, "Time in all", "seconds");
+    report_columns_end(r);
+    if (*t.comment) report_code(r, t.comment);
+    grid_of(r, &t, NULL, heads, stiffness_level);
+    curves_table_free(&t);
+}
+
+static void page_stability(source *s, report *r) {
+    draw_stability(s, r);
+    draw_stiffness(s, r);
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>leave_out
+// ---------------------------------------------------------------------------------------------
+
+enum { FEATURE, OBJECT, OBJECT_WITHOUT, MEMORY, MEMORY_WITHOUT, ABSENT, WITHOUT, RATIO, NOTE };
+
+static const char *const leave_out_header =
+    "feature,object_bytes,object_bytes_without,memory_bytes,memory_bytes_without,"
+    "instructions_absent,instructions_without,ratio,note";
+
+// Absent at run time may cost 2 % more than compiled out.
+static report_level leave_out_level(const curves_table *t, int row, int column) {
+    double v = number(t, row, RATIO);
+    if (column != RATIO || v != v) return REPORT_INFO;
+    return v <= 1.02 ? REPORT_GOOD : REPORT_BAD;
+}
+
+static void leave_out_bars(report *r, const curves_table *t) {
+    double *v = (double *)calloc((size_t)t->rows + 1, sizeof *v);
+    const char **name = (const char **)calloc((size_t)t->rows + 1, sizeof *name);
+    int n = 0;
+    for (int i = 0; v && name && i < t->rows; i++) {
+        double saved = 1e-3 * (number(t, i, OBJECT) - number(t, i, OBJECT_WITHOUT));
+        if (saved > 0) name[n] = curves_cell(t, i, FEATURE), v[n++] = saved;
+    }
+    report_series s;
+    memset(&s, 0, sizeof s);
+    s.name = "saved", s.y = v, s.count = n;
+    report_plot p = report_plot_default("Object code that leaving it out saves", "kB", NULL);
+    if (n) report_add_bars(r, &p, name, &s, 1);
+    free(v), free((void *)name);
+}
+
+static void page_leave_out(source *s, report *r) {
+    static const char *const heads[9] = {"feature",      "object code, bytes",
+                                         "compiled out", "memory, bytes",
+                                         "compiled out", "instructions a step, absent at run time",
+                                         "compiled out", "ratio",
+                                         "note"};
+    char path[700], text[100];
+    curves_table t;
+    int over = 0, measured = 0;
+    double worst = 0;
+    if (!open_table(s, r, "leave_out.csv", leave_out_header, "sh bench/leave_out.sh out/report", &t,
+                    path))
+        return;
+    for (int i = 0; i < t.rows; i++) {
+        double ratio = number(&t, i, RATIO);
+        if (ratio != ratio) continue;
+        worst = fmax(worst, ratio), measured++, over += ratio > 1.02;
+    }
+    snprintf(text, sizeof text, "%d", t.rows);
+    report_status(r, "Features", text, REPORT_INFO);
+    snprintf(text, sizeof text, "%d of %d", measured - over, measured);
+    report_status(r, "Cost nothing when absent (ratio at most 1.02)", text,
+                  !measured ? REPORT_WARN
+                  : over    ? REPORT_BAD
+                            : REPORT_GOOD);
+    snprintf(text, sizeof text, "%.4f", worst);
+    if (measured) report_status(r, "Worst ratio", text, over ? REPORT_BAD : REPORT_GOOD);
+    report_text(
+        r,
+        "What a scene does not use costs nothing: the step without the feature, the feature's "
+        "code there but unused, over the same step with its code compiled out. The ratio must "
+        "be at most 1.02.");
+    if (*t.comment) report_code(r, t.comment);
+    grid_of(r, &t, NULL, heads, leave_out_level);
+    leave_out_bars(r, &t);
+    curves_table_free(&t);
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>pages
+// ---------------------------------------------------------------------------------------------
+
+static const struct {
+    const char *file, *title;
+    void (*draw)(source *, report *);
+} pages[] = {
+    {"index.html", "Error against run time", page_index},
+    {"stability.html", "Stability on stiff and extreme cases", page_stability},
+    {"leave_out.html", "Leaving out what a scene does not need", page_leave_out},
+};
+
+enum { PAGES = sizeof pages / sizeof *pages };
+
+// 1: every page written and every file that is there read.
+static int write_pages(const char *results, const char *out, const char *to) {
+    source s = {results, out, 0};
+    for (int k = 0; k < PAGES; k++) {
+        report_link links[PAGES];
+        report_error why;
+        report *r = report_begin(pages[k].title, NULL);
+        for (int j = 0; j < PAGES; j++)
+            links[j].file = j == k ? NULL : pages[j].file, links[j].text = pages[j].title;
+        report_links(r, links, PAGES);
+        pages[k].draw(&s, r);
+        if (!report_end_as(r, to, pages[k].file, &why))
+            fprintf(stderr, "report: %s\n", why.message), s.failed = 1;
+    }
+    return !s.failed;
+}
+
+#ifndef REPORT_NO_MAIN
+int main(int argc, char **argv) {
+    const char *to = NULL, *folder[2] = {NULL, NULL};
+    int n = 0;
+    for (int i = 1; i < argc; i++)
+        if (!strcmp(argv[i], "-o") && i + 1 < argc)
+            to = argv[++i];
+        else if (argv[i][0] != '-' && n < 2)
+            folder[n++] = argv[i];
+        else
+            n = 3, i = argc;
+    if (n != 2) {
+        fprintf(stderr, "usage: report [-o OUT] RESULTS_DIR OUT_DIR\n");
+        return 2;
+    }
+    if (!to) to = folder[1];
+    int ok = write_pages(folder[0], folder[1], to);
+    printf("%s/index.html\n", to);
+    return ok ? 0 : 1;
+}
+#endif
