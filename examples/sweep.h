@@ -4,8 +4,8 @@
 
        subspace   all modes of the bases, no nodes (error_modes empty), and modes that come by the
                   oracle: a row for each of --modes
-       adaptive   a row for each of --nodes at the first of --modes and the scene's tol; the other
-                  --modes and --tols at the middle one of --nodes
+       adaptive   a row for each of --nodes and --tols at the first of --modes; the other --modes
+                  at the middle one of --nodes and the scene's tol
        direct pcg auto    full space, a row for each of --tols
 
    The reference is full space at a ten-thousandth of the scene's tol. Its way is taken once; each step of
@@ -20,7 +20,7 @@
    steps, DIR/report.html the curves. SCENE_subspace.png and SCENE_adaptive.png show the error on the
    bodies in the step in which the subspace alone is worst, SCENE_enriched.png the nodes added.  */
 
-#define SWEEP_MOST 24
+#define SWEEP_MOST 32
 
 typedef struct sweep_entry {
     const char *method;
@@ -120,9 +120,9 @@ static int sweep_plan(run *r, sweep *s) {
         ok = sweep_add(r, s, "adaptive", own, TSS_MODE_ADAPTIVE, nodes[k], modes[0], s->tol);
     for (int k = 1; ok && k < m; k++)
         ok = sweep_add(r, s, "adaptive", own, TSS_MODE_ADAPTIVE, nodes[n / 2], modes[k], s->tol);
-    for (int k = 0; ok && k < t; k++)
-        if (tols[k] != s->tol)
-            ok = sweep_add(r, s, "adaptive", own, TSS_MODE_ADAPTIVE, nodes[n / 2], modes[0], tols[k]);
+    for (int q = 0; q < t; q++)
+        for (int k = 0; ok && tols[q] != s->tol && k < n; k++)
+            ok = sweep_add(r, s, "adaptive", own, TSS_MODE_ADAPTIVE, nodes[k], modes[0], tols[q]);
     for (int f = 0; f < 3; f++)
         for (int k = 0; ok && k < t; k++)
             ok = sweep_add(r, s, full[f].name, full[f].linear, TSS_MODE_FULL, -1, -1, tols[k]);
@@ -398,6 +398,22 @@ static int sweep_pictures(run *r, sweep *s) {
     return ok;
 }
 
+// The curves, from the files just written.
+static int sweep_report(run *r, sweep *s) {
+    char rows[700], steps[700], name[120];
+    curves c;
+    curves_error why;
+    report_error bad;
+    fclose(s->rows), s->rows = NULL;
+    snprintf(rows, sizeof rows, "%s/error_vs_time.csv", r->o.out);
+    snprintf(steps, sizeof steps, "%s/error_steps.csv", r->o.out);
+    if (!curves_read(&c, rows, steps, &why)) return fail(r, "%s", why.message);
+    report *p = report_begin(sweep_name(r, name), "error against run time");
+    curves_draw(p, &c, r->o.out);
+    curves_free(&c);
+    return report_end(p, r->o.out, &bad) ? 1 : fail(r, "%s", bad.message);
+}
+
 // Bases are made once and read by the other worlds; the reference and full space have none.
 static void sweep_cache(run *r) {
     for (int b = 0; b < r->s.bodies; b++)
@@ -432,7 +448,7 @@ static int sweep_run(run *r, sweep *s) {
     double *end = (double *)need((size_t)tss_world_nodes(s->ref.w) * (size_t)tss_world_dim(s->ref.w), sizeof *end);
     ok = ok && sweep_goal(r, s, start, size, motions, end) && sweep_free(r, s, motions, end);
     free(start), free(motions), free(end);
-    return ok && sweep_table(r, s) && sweep_pictures(r, s);
+    return ok && sweep_table(r, s) && sweep_pictures(r, s) && sweep_report(r, s);
 }
 
 static int command_sweep(run *r) {

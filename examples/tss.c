@@ -5,6 +5,7 @@
                  [--mode adaptive|subspace|full] [--snapshots FILE]
                  [--color enriched|error|progress|speed|J|strain|none]
    tss compare SCENE [-o DIR] [--steps N] [--free-steps M] [--from STEP] [--repeat K] ...
+   tss compare --sweep SCENE [--nodes LIST] [--modes LIST] [--tols LIST] [--name NAME] ...
    tss modes SCENE [-o DIR] [--count K] ...
    tss check SCENE [--assets DIR] [--set key=value]...
    tss --version | --help
@@ -16,6 +17,7 @@
    (tests/checker.h). --snapshots keeps positions each K steps, for a basis of kind pod. check is
    the doctor: it says what is wrong with a scene, and takes no step. modes lists and draws bases.
 
+   compare --sweep: error against run time over solvers and tolerances, sweep.h.
    compare takes each step from the same state in full space (direct, pcg, auto) and adaptively;
    then M steps freely. DIR/compare.csv has a row a step. Its last line:
        error E speedup S best B final F
@@ -37,12 +39,14 @@
 #include "tss_io.h"
 #include "tss_shapes.h"
 
+#define REPORT_IMPLEMENTATION
+#include "report.h"
+#define CURVES_IMPLEMENTATION
+#include "curves.h"
 #define SCENE_IMPLEMENTATION
 #include "scene.h"
 #define VIEW_IMPLEMENTATION
 #include "view.h"
-#define REPORT_IMPLEMENTATION
-#include "report.h"
 
 #include "checker.h"
 
@@ -79,6 +83,8 @@ static int usage(FILE *to) {
         "       tss compare SCENE [-o DIR] [--steps N] [--free-steps M] [--from STEP] [--repeat "
         "K]\n"
         "               [--threads N] [--assets DIR] [--set key=value]...\n"
+        "       tss compare --sweep SCENE [--nodes 1,0.5,...] [--modes 0.5,...] [--tols m/s,...]\n"
+        "               [--name NAME], and the options of compare\n"
         "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
         "       tss --version\n",
@@ -1150,7 +1156,8 @@ static double *column_of(const run *r, column k) {
 
 // One plot over time; nothing is drawn for the end of the list (-1).
 static void plot(report *p, const run *r, report_plot look, const column *which, int count) {
-    report_series series[8] = {{NULL, NULL, NULL, 0}};
+    report_series series[8];
+    memset(series, 0, sizeof series);
     double *x = column_of(r, COL_time), *y[8];
     for (int k = 0; k < count; k++) {
         y[k] = column_of(r, which[k]);
