@@ -23,7 +23,7 @@ ifndef PARALLEL
 .NOTPARALLEL:
 endif
 
-.PHONY: help all deps demo report test test-programs examples run-examples bench sanitize fuzz nodeps compat clean
+.PHONY: help all deps demo report test test-programs examples run-examples bench bench-error sanitize fuzz nodeps compat clean
 
 all: examples
 
@@ -92,6 +92,12 @@ sanitize nodeps compat fuzz:
 #: bench         speed against peers and reference figures → out/bench/*.csv (minutes)
 bench:
 	@sh bench/run.sh $(BUILD) $(OUT)/bench
+
+#: bench-error   error against run time at 50,000 tets and more → bench/results (an hour; goes on where it stopped)
+bench-error: $(BUILD)/tss
+	@sh bench/error.sh -b $(BUILD) large $(OUT)/bench-error
+	@mkdir -p bench/results
+	@cp $(OUT)/bench-error/error_vs_time.csv $(OUT)/bench-error/error_steps.csv bench/results/
 
 clean:
 	rm -rf $(BUILD) $(OUT)

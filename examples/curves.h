@@ -791,10 +791,14 @@ static const char *curves__sweeps(curves_method m) {
 
 void curves_name(const curves_row *r, char *text, size_t size) {
     char a[32], b[32];
-    snprintf(text, size, "%s, %s %s", curves_methods[r->method], curves__sweeps(r->method),
-             curves__g(curves__swept(r), a));
+    if (curves__finite(curves__swept(r)))
+        snprintf(text, size, "%s, %s %s", curves_methods[r->method], curves__sweeps(r->method),
+                 curves__g(curves__swept(r), a));
+    else
+        snprintf(text, size, "%s, all modes", curves_methods[r->method]);
     if (r->method == CURVES_ADAPTIVE && curves__finite(r->error_modes))
         curves__add(text, size, ", error_modes %s", curves__g(r->error_modes, b));
+    if (r->method == CURVES_ADAPTIVE) curves__add(text, size, ", tol %s", curves__g(r->tol, b));
 }
 
 static const double curves__levels[4] = {0.1, 0.03, 0.01, 0.003};
@@ -876,6 +880,26 @@ static int curves__sorted(const curves *c, int scene, curves_method m, int *row)
     return n;
 }
 
+// The same of one group: of the adaptive runs those with the same tol and error_modes, in the order of
+// the file (group 0 is the first there); other methods have one group. 0: no such group.
+static int curves__group(const curves *c, int scene, curves_method m, int group, int *row) {
+    int all = curves__sorted(c, scene, m, row), n = 0, first = -1;
+    if (m != CURVES_ADAPTIVE) return group == 0 ? all : 0;
+    for (int k = 0, seen = -1; k < c->rows && seen < group; k++) {
+        const curves_row *r = &c->row[k];
+        int old = r->scene != scene || r->method != m;
+        for (int j = 0; j < k && !old; j++)
+            old = c->row[j].scene == scene && c->row[j].method == m && c->row[j].tol == r->tol &&
+                  curves__same(c->row[j].error_modes, r->error_modes);
+        if (!old && ++seen == group) first = k;
+    }
+    for (int i = 0; i < all && first >= 0; i++)
+        if (c->row[row[i]].tol == c->row[first].tol &&
+            curves__same(c->row[row[i]].error_modes, c->row[first].error_modes))
+            row[n++] = row[i];
+    return n;
+}
+
 // What the least error of reduced runs is to the floor of the plot: full space at tight tolerances
 // lies decades below and would press the rest together.
 static double curves__floor(const curves *c, int scene, curves_measure m) {
@@ -889,36 +913,56 @@ static double curves__floor(const curves *c, int scene, curves_measure m) {
     return curves__finite(least) ? 0.1 * least : 0;
 }
 
+enum { CURVES__GROUPS = 8 };  // of adaptive runs, at most drawn
+
+// The points of one line; *low: some lie below the lower edge.
+static void curves__points(const curves *c, curves_measure m, double least, const int *row, int count,
+                           double *x, double *y, char (*text)[32], const char **label, int *low) {
+    for (int i = 0; i < count; i++) {
+        const curves_row *at = &c->row[row[i]];
+        double error = curves_error_of(at, m);
+        int under = error < least;
+        if (under) error = least, *low = 1;
+        x[i] = at->seconds, y[i] = 100 * error;
+        // Of those on the lower edge only the first, or they hide each other.
+        if (!under || i == 0 || y[i - 1] > y[i])
+            label[i] = curves__finite(curves__swept(at)) ? curves__g(curves__swept(at), text[i]) : "all";
+    }
+}
+
+static void curves__group_name(const curves *c, const int *row, int group, char *text, size_t size) {
+    char tol[32], modes[32];
+    const curves_row *at = &c->row[row[0]];
+    if (group == 0)
+        snprintf(text, size, "%s", curves__names[at->method]);
+    else
+        snprintf(text, size, "adaptive, tol %s m/s, error_modes %s", curves__g(at->tol, tol),
+                 curves__g(at->error_modes, modes));
+}
+
 void curves_draw_errors(report *r, const curves *c, int scene, curves_measure m,
                         const char *title) {
     size_t n = (size_t)c->rows + 1;
     double *x = (double *)calloc(2 * n, sizeof *x), *y = x ? x + n : NULL;
     int *row = (int *)calloc(n, sizeof *row), series = 0, used = 0, low = 0;
-    char(*text)[32] = (char(*)[32])calloc(n, sizeof *text);
+    char(*text)[32] = (char(*)[32])calloc(n, sizeof *text), name[CURVES_METHODS + CURVES__GROUPS][80];
     const char **label = (const char **)calloc(n, sizeof *label);
     double least = curves__floor(c, scene, m);
-    report_series s[CURVES_METHODS];
+    report_series s[CURVES_METHODS + CURVES__GROUPS];
     memset(s, 0, sizeof s);
-    for (int k = 0; x && row && text && label && k < CURVES_METHODS; k++) {
-        curves_method method = curves__order[k];
-        int count = curves__sorted(c, scene, method, row);
-        for (int i = 0; i < count; i++) {
-            const curves_row *at = &c->row[row[i]];
-            double error = curves_error_of(at, m);
-            int under = error < least;
-            if (under) error = least, low = 1;
-            x[used + i] = at->seconds, y[used + i] = 100 * error;
-            // Of those on the lower edge only the first, or they hide each other.
-            if (!under || i == 0 || y[used + i - 1] > y[used + i])
-                label[used + i] = curves__g(curves__swept(at), text[used + i]);
+    for (int k = 0; x && row && text && label && k < CURVES_METHODS; k++)
+        for (int g = 0; g < CURVES__GROUPS; g++) {
+            curves_method method = curves__order[k];
+            int count = curves__group(c, scene, method, g, row);
+            if (!count) break;
+            curves__points(c, m, least, row, count, x + used, y + used, text + used, label + used, &low);
+            curves__group_name(c, row, g, name[series], sizeof name[series]);
+            s[series].name = name[series], s[series].x = x + used, s[series].y = y + used;
+            s[series].count = count, s[series].label = label + used;
+            s[series].style = method >= CURVES_DIRECT ? REPORT_DASHED : g ? REPORT_DOTTED : REPORT_SOLID;
+            s[series].colour = curves__colour[method];
+            used += count, series++;
         }
-        if (!count) continue;
-        s[series].name = curves__names[method], s[series].x = x + used, s[series].y = y + used;
-        s[series].count = count, s[series].label = label + used;
-        s[series].style = method >= CURVES_DIRECT ? REPORT_DASHED : REPORT_SOLID;
-        s[series].colour = curves__colour[method];
-        used += count, series++;
-    }
     report_plot p = report_plot_default(title, "run time, s", "error, %");
     p.log_x = p.log_y = p.markers = 1, p.height = 400;
     if (low) p.note = "Errors below the lower edge are drawn on it.";
@@ -1067,10 +1111,10 @@ static int curves__phases(const curves *c, int row, double sum[CURVES_PHASES]) {
 
 enum { CURVES__BARS = 14 };
 
-// The bars: all adaptive rows, the ends of subspace only, full space at the scene's own tolerance.
+// The bars: the adaptive rows of the first group, the ends of subspace only, full space at the scene's own tolerance.
 static int curves__bars(const curves *c, int scene, int *row) {
     curves_advice a = curves_recommend(c, scene, CURVES_MAX, 0.01);
-    int n = 0, count = curves__sorted(c, scene, CURVES_ADAPTIVE, row);
+    int n = 0, count = curves__group(c, scene, CURVES_ADAPTIVE, 0, row);
     int *sub = (int *)calloc((size_t)c->rows + 1, sizeof *sub);
     n = count < CURVES__BARS - 5 ? count : CURVES__BARS - 5;
     count = sub ? curves__sorted(c, scene, CURVES_SUBSPACE, sub) : 0;
@@ -1098,8 +1142,11 @@ static void curves__draw_phases(report *r, const curves *c, int scene) {
         const curves_row *at = &c->row[row[i]];
         if (!curves__phases(c, row[i], sum)) continue;
         for (int j = 0; j < CURVES_PHASES; j++) value[j][n] = sum[j];
-        snprintf(text[n], sizeof text[n], "%s, %s %s", curves_methods[at->method],
-                 curves__sweeps(at->method), curves__g(curves__swept(at), g));
+        if (curves__finite(curves__swept(at)))
+            snprintf(text[n], sizeof text[n], "%s, %s %s", curves_methods[at->method],
+                     curves__sweeps(at->method), curves__g(curves__swept(at), g));
+        else
+            snprintf(text[n], sizeof text[n], "%s, all modes", curves_methods[at->method]);
         names[n] = text[n], n++;
     }
     free(row);
@@ -1124,7 +1171,7 @@ static void curves__draw_over_steps(report *r, const curves *c, int scene, int w
     report_series s[MOST];
     memset(s, 0, sizeof s);
     for (int k = 0; x && row && k < 2; k++) {
-        int count = curves__sorted(c, scene, k ? CURVES_SUBSPACE : CURVES_ADAPTIVE, row);
+        int count = curves__group(c, scene, k ? CURVES_SUBSPACE : CURVES_ADAPTIVE, 0, row);
         for (int i = 0; i < count && series < (k ? MOST : MOST - 2); i++) {
             // Of subspace only the loosest and the tightest.
             if (k && i > 0 && i < count - 1) continue;
@@ -1136,8 +1183,9 @@ static void curves__draw_over_steps(report *r, const curves *c, int scene, int w
                     used++;
                 }
             if (used == first || (what == 1 && k)) continue;
+            double swept = curves__swept(&c->row[row[i]]);
             snprintf(text[series], sizeof text[series], "%s %s", k ? "subspace only" : "adaptive",
-                     curves__g(curves__swept(&c->row[row[i]]), g));
+                     curves__finite(swept) ? curves__g(swept, g) : "all modes");
             s[series].name = text[series], s[series].x = x + first, s[series].y = y + first;
             s[series].count = used - first;
             if (k) s[series].style = i ? REPORT_DOTTED : REPORT_DASHED;

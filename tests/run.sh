@@ -159,10 +159,12 @@ scenes() {
     done
 }
 
-# Paper A's figures on small meshes: a line `ok` or `FAILED` a claim.
-figures() {
-    out="$log/figures.log"
-    sh tests/figures.sh "$build" >"$out" 2>&1
+# Paper A's figures on small meshes: a line `ok` or `FAILED` a claim. And the sweep of tolerances.
+figures() { claims figures; claims sweep; }
+
+claims() {
+    out="$log/$1.log"
+    sh "tests/$1.sh" "$build" >"$out" 2>&1
     grep -E '^(ok|FAILED) ' "$out"
     p=$(grep -c '^ok ' "$out"); f=$(grep -c '^FAILED ' "$out")
     [ "$((p + f))" -gt 0 ] || { f=1; tail -n 15 "$out"; }

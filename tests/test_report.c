@@ -96,7 +96,7 @@ static void test_read(void **state) {
     assert_string_equal(c.step[0].status, "converged");
     char name[80];
     curves_name(&c.row[4], name, sizeof name);
-    assert_string_equal(name, "adaptive, error_nodes 0.01, error_modes 0.001");
+    assert_string_equal(name, "adaptive, error_nodes 0.01, error_modes 0.001, tol 0.001");
     curves_name(&c.row[7], name, sizeof name);
     assert_string_equal(name, "direct, tol 0.001");
     curves_free(&c);
