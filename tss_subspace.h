@@ -2505,6 +2505,7 @@ struct tss_subspace {
     tss__sub_buf dq;                                     // d_q of the last iterate, and room
     tss__sub_buf dyn_ptr, dyn_id;                        // node → stencils that change (entry, id)
     tss__sub_buf activate;                               // by group: the oracle's answer
+    tss__sub_buf near_slot, factored;                    // see tss__sub_near; candidates of a basis
     tss__sub_buf pending;                                // from a checkpoint, until groups exist
     int pending_n, pending_groups;
 };
@@ -4802,6 +4803,7 @@ typedef struct tss__sub_near {  // what R needs: the gradient of all stencils ar
     int j[512];
     double sum[512][3];
     int count;
+    int *slot;  // by node: its place in sum, or −1
 } tss__sub_near;
 
 static double tss__sub_norm(const double *v, int d) {
@@ -4818,11 +4820,12 @@ static void tss__sub_near_add(const tss_subspace *s, const tss_iterate *it, cons
     v->def->gradient(v->def->user, it->ctx, it->x, ids, n->g);
     for (int k = 0; k < count; k++)
         for (int i = 0; i < A; i++) {
-            int node = v->list.node[id[k] * A + i], at = 0;
+            int node = v->list.node[id[k] * A + i];
             if (node < 0 || u->row[node] < 0) continue;
-            while (at < n->count && n->j[at] != node) at++;
-            if (at == n->count) {
-                if (at == 512) continue;  // a ring of more than 512 nodes: enough has been seen
+            int at = n->slot[node];
+            if (at < 0) {
+                if (n->count == 512) continue;  // a ring of more than 512 nodes: enough has been seen
+                at = n->slot[node] = n->count;
                 n->j[n->count++] = node, n->sum[at][0] = n->sum[at][1] = n->sum[at][2] = 0;
             }
             for (int c = 0; c < d; c++) n->sum[at][c] += v->scale * n->g[(k * A + i) * d + c];
@@ -4848,6 +4851,7 @@ static double tss__sub_ring_gradient(const tss_subspace *s, const tss_iterate *i
     for (int k = 0; k < n->count; k++) {
         double l = tss__sub_norm(n->sum[k], s->dim);
         sum += l, squares += l * l;
+        n->slot[n->j[k]] = -1;
     }
     return s->def.oracle == TSS_ORACLE_LITERAL ? sqrt(squares) : sum;
 }
@@ -4956,6 +4960,15 @@ static void tss__sub_block_rows(const tss_subspace *s, int body, const tss__sub_
         tss__basis_rows(&b->b, tss__sub_X(s, m), s->dim, NULL, m->nodes, &q->block, 1, U, f);
 }
 
+// What was measured becomes 𝒢_s (see TSS__SUB_MODE_ERROR).
+static void tss__sub_block_judge(const tss_subspace *s, const tss_iterate *it, tss__sub_block *q, double error) {
+    q->error = error;
+    if (s->query) return;
+    double now = q->error, last = it->number == 0 ? 0 : q->last;
+    if (s->def.oracle != TSS_ORACLE_LITERAL && last < now) q->error = last;
+    q->last = now;
+}
+
 // 𝒢_s (Eq. 12, 14, 16): g^s = M Φ Φᵀ∇E, Φ the block's functions, orthonormal in the mass; max over
 // the nodes of ‖g_j^s‖ l/η_j, which meshes agree on; as printed ‖g_j^s‖/γ_j.
 // U: room for the block's rows and 3 f sums behind them.
@@ -4975,7 +4988,7 @@ static void tss__sub_block_error(const tss_subspace *s, const tss_iterate *it, i
             for (int k = 0; k < f; k++)
                 sum[vector ? k : p * f + k] += U[vector ? (i * d + p) * f + k : i * f + k] * g[i * d + p];
     }
-    q->error = 0;
+    double most = 0;
     for (int i = 0; i < m->nodes; i++) {
         double v[3] = {0, 0, 0}, eta = tss__sub_f(&s->eta)[m->first + i];
         if (tss__sub_i(&s->body_of)[m->first + i] != body || !(eta > 0)) continue;
@@ -4984,12 +4997,99 @@ static void tss__sub_block_error(const tss_subspace *s, const tss_iterate *it, i
                 v[p] += U[vector ? (i * d + p) * f + k : i * f + k] * sum[vector ? k : p * f + k];
         double scale = literal ? tss__sub_f(&s->gamma_print)[m->first + i] : eta / m->diagonal / TSS__SUB_MODE_ERROR;
         double e = mass[i] / all * tss__sub_norm(v, d) / (ah2 * scale);
-        q->error = e > q->error ? e : q->error;
+        most = e > most ? e : most;
     }
-    if (s->query) return;
-    double now = q->error, last = it->number == 0 ? 0 : q->last;
-    if (!literal && last < now) q->error = last;
-    q->last = now;
+    tss__sub_block_judge(s, it, q, most);
+}
+
+// The same of all candidate blocks of a factored basis at once, Φ = w (T m), m = (1, X − centre):
+// Φᵀg = T Σ w m gᵀ and ΦΦᵀg = w (TᵀTΣ) m, so that no row of Φ is formed and a node is read twice.
+// Chunks of nodes are summed in their order.
+typedef struct tss__sub_moments {
+    const tss_subspace *s;
+    const tss_iterate *it;
+    const tss__basis *b;
+    int body, count;
+    const int *block;          // the candidates' numbers in the basis
+    double *S, *C, *mass, *top;  // chunks × count × 12; count × 12; chunks; chunks × count
+} tss__sub_moments;
+
+enum { TSS__SUB_NODES = 512 };  // a chunk
+
+// m of node i; 0: the node is not modal.
+static int tss__sub_moment_row(const tss__sub_moments *q, const tss__modal *m, const double *X, int i, double *row) {
+    if (tss__sub_i(&q->s->body_of)[m->first + i] != q->body) return 0;
+    row[0] = 1, row[3] = 0;
+    for (int a = 0; a < q->s->dim; a++) row[a + 1] = X[i * q->s->dim + a] - q->b->center[a];
+    return 1;
+}
+
+static void tss__sub_moment_task(int chunk, int worker, void *arg) {
+    const tss__sub_moments *q = (const tss__sub_moments *)arg;
+    const tss__modal *m = tss__sub_modal(q->s, q->body);
+    const int d = q->s->dim, from = chunk * TSS__SUB_NODES;
+    const int to = from + TSS__SUB_NODES < m->nodes ? from + TSS__SUB_NODES : m->nodes;
+    const double *X = tss__sub_X(q->s, m), *g = q->it->g + m->first * d, *mass = tss_world_masses(q->s->w) + m->first;
+    double *S = q->S + (size_t)chunk * (size_t)q->count * 12, row[4], own[12], all = 0;
+    (void)worker;
+    memset(S, 0, (size_t)q->count * 12 * sizeof *S);
+    for (int i = from; i < to; i++) {
+        if (!tss__sub_moment_row(q, m, X, i, row)) continue;
+        const double *w = q->b->weight + (size_t)i * (size_t)q->b->blocks;
+        all += mass[i];
+        for (int p = 0; p < 3; p++)
+            for (int a = 0; a < 4; a++) own[4 * p + a] = p < d ? g[i * d + p] * row[a] : 0;
+        for (int j = 0; j < q->count; j++)
+            for (int k = 0; k < 12; k++) S[12 * j + k] += w[q->block[j]] * own[k];
+    }
+    q->mass[chunk] = all;
+}
+
+// C = TᵀT Σ of each block.
+static void tss__sub_moment_sums(const tss__sub_moments *q, int chunks) {
+    const int f = q->s->dim + 1;
+    for (int j = 0; j < q->count; j++) {
+        const double *T = q->b->transform + (size_t)q->block[j] * (size_t)(f * f);
+        double *C = q->C + 12 * j, S[12] = {0};
+        for (int k = 0; k < chunks; k++)
+            for (int e = 0; e < 12; e++) S[e] += q->S[((size_t)k * (size_t)q->count + (size_t)j) * 12 + (size_t)e];
+        memset(C, 0, 12 * sizeof *C);
+        for (int p = 0; p < q->s->dim; p++)
+            for (int k = 0; k < f; k++) {
+                double sum = 0;
+                for (int a = 0; a <= k; a++) sum += T[k * f + a] * S[4 * p + a];
+                for (int a = 0; a <= k; a++) C[4 * p + a] += T[k * f + a] * sum;
+            }
+    }
+}
+
+// Largest squared (mass ‖w C m‖ / scale) of a chunk.
+static void tss__sub_reach_task(int chunk, int worker, void *arg) {
+    const tss__sub_moments *q = (const tss__sub_moments *)arg;
+    const tss_subspace *s = q->s;
+    const tss__modal *m = tss__sub_modal(s, q->body);
+    const int from = chunk * TSS__SUB_NODES, literal = s->def.oracle == TSS_ORACLE_LITERAL;
+    const int to = from + TSS__SUB_NODES < m->nodes ? from + TSS__SUB_NODES : m->nodes;
+    const double *X = tss__sub_X(s, m), *mass = tss_world_masses(s->w) + m->first;
+    double *top = q->top + (size_t)chunk * (size_t)q->count, row[4];
+    (void)worker;
+    for (int j = 0; j < q->count; j++) top[j] = 0;
+    for (int i = from; i < to; i++) {
+        double eta = tss__sub_f(&s->eta)[m->first + i];
+        if (!(eta > 0) || !tss__sub_moment_row(q, m, X, i, row)) continue;
+        const double *w = q->b->weight + (size_t)i * (size_t)q->b->blocks;
+        double r = mass[i] / (literal ? tss__sub_f(&s->gamma_print)[m->first + i] : eta / m->diagonal / TSS__SUB_MODE_ERROR);
+        for (int j = 0; j < q->count; j++) {
+            const double *C = q->C + 12 * j;
+            double v, e = 0, by = r * w[q->block[j]];
+            for (int p = 0; p < 3; p++) {
+                v = C[4 * p] + C[4 * p + 1] * row[1] + C[4 * p + 2] * row[2] + C[4 * p + 3] * row[3];
+                e += v * v;
+            }
+            e *= by * by;
+            top[j] = e > top[j] ? e : top[j];
+        }
+    }
 }
 
 // ℰ_s (Eq. 13, 15, 17): c^s = M Φ̄ Φ̄ᵀ ΔE, Φ̄ the functions averaged over coordinates;
@@ -5029,6 +5129,12 @@ static int tss__sub_candidate(const tss__modal *m, const tss__sub_block *q) {
     return !q->active && m->enriched < m->modal_nodes;
 }
 
+// Whether the block's error is found with those of its whole basis.
+static int tss__sub_is_factored(const tss_subspace *s, const tss__sub_block *q) {
+    const tss__sub_basis *b = tss__sub_base(s, q->basis);
+    return !b->b.vector && b->b.transform != NULL;
+}
+
 typedef struct tss__sub_modes {
     const tss_subspace *s;
     const tss_iterate *it;
@@ -5041,8 +5147,50 @@ static void tss__sub_mode_task(int j, int worker, void *arg) {
     const tss__sub_modes *run = (const tss__sub_modes *)arg;
     const tss__modal *m = tss__sub_modal(run->s, run->body);
     tss__sub_block *q = tss__sub_blocks(m) + j;
-    if (tss__sub_candidate(m, q))
+    if (tss__sub_candidate(m, q) && !tss__sub_is_factored(run->s, q))
         tss__sub_block_error(run->s, run->it, run->body, q, run->work + (size_t)worker * run->each);
+}
+
+// Candidates of a factored basis; their numbers in the basis go to block, in the body's to of.
+static int tss__sub_factored_candidates(const tss_subspace *s, const tss__modal *m, int basis, int *block, int *of) {
+    const tss__sub_basis *b = tss__sub_base(s, basis);
+    int n = 0;
+    for (int j = 0; j < m->blocks && !b->b.vector && b->b.transform; j++) {
+        const tss__sub_block *q = tss__sub_blocks(m) + j;
+        if (q->basis == basis && tss__sub_candidate(m, q)) block[n] = q->block, of[n++] = j;
+    }
+    return n;
+}
+
+static tss_result tss__sub_factored_errors(tss_subspace *s, const tss_iterate *it, int body, int basis) {
+    const tss__modal *m = tss__sub_modal(s, body);
+    const int chunks = (m->nodes + TSS__SUB_NODES - 1) / TSS__SUB_NODES;
+    int *block = (int *)tss__sub_need(s, &s->factored, 2 * (size_t)m->blocks, sizeof(int));
+    if (!block) return tss__sub_no_memory(s);
+    tss__sub_moments q;
+    memset(&q, 0, sizeof q);
+    q.s = s, q.it = it, q.b = &tss__sub_base(s, basis)->b, q.body = body, q.block = block;
+    q.count = tss__sub_factored_candidates(s, m, basis, block, block + m->blocks);
+    if (q.count == 0) return TSS_OK;
+    size_t n = (size_t)q.count, c = (size_t)chunks;
+    q.S = (double *)tss__sub_need(s, &s->columns, c * n * 12 + n * 12 + c + c * n, sizeof(double));
+    if (!q.S) return tss__sub_no_memory(s);
+    q.C = q.S + c * n * 12, q.mass = q.C + n * 12, q.top = q.mass + c;
+    tss_parallel(&s->host, chunks, tss__sub_moment_task, &q);
+    tss__sub_moment_sums(&q, chunks);
+    tss_parallel(&s->host, chunks, tss__sub_reach_task, &q);
+    double all = 0;
+    for (int k = 0; k < chunks; k++) all += q.mass[k];
+    for (int j = 0; j < q.count; j++) {
+        double most = 0;
+        for (int k = 0; k < chunks; k++) {
+            double e = q.top[(size_t)k * n + (size_t)j];
+            most = e > most ? e : most;
+        }
+        double error = all > 0 ? sqrt(most) / (all * tss__sub_ah2(s, it->ctx)) : 0;
+        tss__sub_block_judge(s, it, tss__sub_blocks(m) + block[m->blocks + j], error);
+    }
+    return TSS_OK;
 }
 
 // Errors of all inactive blocks; *open: some are above ε_G.
@@ -5050,16 +5198,26 @@ static tss_result tss__sub_mode_errors(tss_subspace *s, const tss_iterate *it, i
     for (int k = 0; k < s->modal_count; k++) {
         const tss__modal *m = tss__sub_modal(s, k);
         tss__sub_modes run = {s, it, k, NULL, 0};
+        int candidates = 0;
         for (int j = 0; j < m->blocks; j++) {
             int f;
             if (!tss__sub_candidate(m, tss__sub_blocks(m) + j)) continue;
+            candidates++;
+            if (tss__sub_is_factored(s, tss__sub_blocks(m) + j)) continue;
             size_t room = tss__sub_block_room(s, k, tss__sub_blocks(m) + j, &f) + (size_t)(3 * f);
             run.each = room > run.each ? room : run.each;
         }
-        if (run.each == 0) continue;
-        run.work = (double *)tss__sub_need(s, &s->columns, run.each * (size_t)tss_workers(&s->host), sizeof(double));
-        if (!run.work) return tss__sub_no_memory(s);
-        tss_parallel(&s->host, m->blocks, tss__sub_mode_task, &run);
+        if (candidates == 0) continue;
+        for (int j = 0; j < s->basis_count; j++) {
+            const tss__sub_basis *b = tss__sub_base(s, j);
+            tss_result r = b->live && b->body == k ? tss__sub_factored_errors(s, it, k, j) : TSS_OK;
+            if (r != TSS_OK) return r;
+        }
+        if (run.each > 0) {
+            run.work = (double *)tss__sub_need(s, &s->columns, run.each * (size_t)tss_workers(&s->host), sizeof(double));
+            if (!run.work) return tss__sub_no_memory(s);
+            tss_parallel(&s->host, m->blocks, tss__sub_mode_task, &run);
+        }
         for (int j = 0; j < m->blocks; j++)
             *open |= tss__sub_candidate(m, tss__sub_blocks(m) + j) && tss__sub_blocks(m)[j].error > s->def.error_modes;
     }
@@ -5128,7 +5286,11 @@ static tss_result tss__sub_ask_oracle(tss_subspace *s, const tss_iterate *it, co
     q.s = s, q.it = it, q.u = u, q.all = s->query || s->def.on_oracle != NULL;
     q.near = (tss__sub_near *)tss__sub_need(s, &s->scratch, (size_t)tss_workers(&s->host), sizeof(tss__sub_near));
     q.activate = (uint8_t *)tss__sub_need(s, &s->activate, (size_t)s->groups, 1);
-    if (!q.near || !q.activate) return tss__sub_no_memory(s);
+    int workers = tss_workers(&s->host);
+    int *slot = (int *)tss__sub_need(s, &s->near_slot, (size_t)workers * (size_t)s->n, sizeof(int));
+    if (!q.near || !q.activate || !slot) return tss__sub_no_memory(s);
+    memset(slot, 0xff, (size_t)workers * (size_t)s->n * sizeof(int));
+    for (int k = 0; k < workers; k++) q.near[k].slot = slot + (size_t)k * (size_t)s->n;
     tss_parallel(&s->host, (s->n + 1023) / 1024, tss__sub_force_task, &q);
     tss_parallel(&s->host, s->groups, tss__sub_error_task, &q);
     for (int g = 0; g < s->groups; g++) open |= q.activate[g];
@@ -5612,7 +5774,7 @@ static void tss__sub_destroy(void *user, const tss_host *host) {
         &s->H, &s->cross, &s->cross_val, &s->lane, &s->xrow, &s->xnode, &s->border, &s->border_index,
         &s->border_ptr, &s->border_link, &s->border_u, &s->x_ptr, &s->x_link, &s->small,
         &s->small_work, &s->small_rhs, &s->factors, &s->modal_work, &s->columns, &s->pair_key, &s->solution,
-        &s->scratch, &s->xmask, &s->dq, &s->dyn_ptr, &s->dyn_id, &s->pending, &s->activate, &s->held};
+        &s->scratch, &s->xmask, &s->dq, &s->dyn_ptr, &s->dyn_id, &s->pending, &s->activate, &s->near_slot, &s->factored, &s->held};
     for (size_t k = 0; k < sizeof all / sizeof *all; k++) tss__sub_drop(s, all[k]);
     tss_bcsr_free(&h, &s->Ax), tss_bcsr_free(&h, &s->Cx), tss_bcsr_free(&h, &s->Sq);
     tss_chol_destroy(s->chol_q), tss_chol_destroy(s->chol_x);
