@@ -637,6 +637,61 @@ static void test_own_matrix(void **state) {
     assert_true(y.some > 0 && y.H < 1e-10);
 }
 
+// ---- errors of blocks ----------------------------------------------------------------------------
+
+// From moments (all blocks of a factored basis at once) and from the rows of Φ, one by one.
+static void look_at_blocks(spy *y, tss_world *w, const tss_iterate *it) {
+    tss_subspace *s = y->s;
+    double *U = doubles(200000);
+    (void)w;
+    s->query = 1;  // what was measured, not what persists over two iterates
+    for (int k = 0; k < s->modal_count; k++) {
+        const tss__modal *m = tss__sub_modal(s, k);
+        for (int j = 0; j < s->basis_count; j++)
+            if (tss__sub_base(s, j)->body == k) ok(w, tss__sub_factored_errors(s, it, k, j));
+        for (int j = 0; j < m->blocks; j++) {
+            tss__sub_block q = tss__sub_blocks(m)[j];
+            int f;
+            if (!tss__sub_candidate(m, &q) || !tss__sub_is_factored(s, &q)) continue;
+            assert_true(tss__sub_block_room(s, k, &q, &f) + (size_t)(3 * f) < 200000);
+            tss__sub_block_error(s, it, k, &q, U);
+            // in free flight both are rounding; the thresholds are tenths
+            y->H = fmax(y->H, fabs(q.error - tss__sub_blocks(m)[j].error) / fmax(q.error, 1e-4));
+            y->some += q.error > 1e-3;
+        }
+    }
+    s->query = 0;
+    free(U);
+}
+
+static void test_block_errors(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++)
+        for (int literal = 0; literal < 2; literal++) {
+            const plan p = {.dim = dim,
+                            .n = 4,
+                            .bodies = 2,
+                            .contact = 1,
+                            .speed = 1,
+                            .E = 3e4,
+                            .count = 12,
+                            .lower = TSS_BASIS_SKINNING,
+                            .upper = TSS_BASIS_SKINNING};
+            tss_subspace_def d = tss_subspace_def_default();
+            scene s;
+            spy y;
+            memset(&y, 0, sizeof y);
+            d.partitions = 12, d.oracle = literal ? TSS_ORACLE_LITERAL : TSS_ORACLE_RING, d.error_modes = 1e3;
+            make(&s, &p, &d);
+            y.look = look_at_blocks;
+            spy_on(&y, &s);
+            for (int k = 0; k < 6; k++) step(&s);
+            print_message("    %dD%s: %d blocks, deviation %.1e\n", dim, literal ? " literal" : "", y.some, y.H);
+            assert_true(y.some > 10 && y.H < 1e-10);
+            drop(&s);
+        }
+}
+
 // ---- secants ----------------------------------------------------------------------------------
 
 // The solver's own coupled matrix (secants and all) in its coordinates; must be positive definite.
@@ -2343,6 +2398,7 @@ int main(void) {
         cmocka_unit_test(test_system),
         cmocka_unit_test(test_own_matrix),
         cmocka_unit_test(test_secants),
+        cmocka_unit_test(test_block_errors),
         cmocka_unit_test(test_modal_gradients),
         cmocka_unit_test(test_skip_rule),
         cmocka_unit_test(test_full_limit),
