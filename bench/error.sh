@@ -39,10 +39,12 @@ scene() {
     spikes) run spikes fig2_spikes 3 5 "$b0=16" "$b0=32" ;;
     cone) run cone fig4_cone 2 5 "$b0=10" "$b0=20" ;;
     ramp) run ramp fig5_ramp 20 5 "$b0=[8,8,8]" "$b0=[22,22,22]" ;;
-    cube) run cube fig9_cube 2 5 "$b0=[11,11,11]" "$b0=[22,22,22]" ;;
+    # (off the axis: with a vertex right over the tip, which side it slips to is chance)
+    cube) t="--set bodies.0.translate=[0.013,0.22,0.007]"
+          run cube fig9_cube 2 5 "$b0=[11,11,11] $t" "$b0=[22,22,22] $t" ;;
     beam) run beam fig10_beam 3 5 "$b0=[50,5,5]" "$b0=[102,10,10]" ;;
     roller) run roller fig11_roller 3 5 "$b0=[16,3,8] $b1=14" "$b0=[40,8,20] $b1=20" ;;
-    boat) run boat fig12_boat 2 5 "$b0=22" "$b0=44" ;;
+    boat) run boat fig12_boat 2 5 "$b0=22" "$b0=46" ;;
     city) run city fig13_city 3 5 "$b0=14 $b1=12" "$b0=22 $b1=18" ;;
     fist) run fist fig15_fist 1 4 "$b0=9 $b1=9" "$b0=19 $b1=19" ;;
     *) echo "$1: no such scene" >&2; return 1 ;;
