@@ -3557,6 +3557,15 @@ static int tss__ipc_excludes(const tss_ipc *p) {
     return 0;
 }
 
+// Are there two primitives that may meet? Not where one body is alone and does not meet itself: the
+// broad phase then gets nothing to do.
+static int tss__ipc_any_pair(const tss_ipc *p) {
+    const int *body = (const int *)p->body_of.p, *point = p->surface.point;
+    for (int i = 1; i < p->surface.points; i++)
+        if (body[point[i]] != body[point[0]]) return 1;
+    return p->surface.points > 0 && !((const uint8_t *)p->self_off.p)[body[point[0]]];
+}
+
 // The surface as the broad phase wants it. Its arrays are copies where they must outlive a call.
 static tss_result tss__ipc_set_mesh(tss_ipc *p, const tss_ctx *c) {
     tss__broad_mesh m;
@@ -3574,9 +3583,11 @@ static tss_result tss__ipc_set_mesh(tss_ipc *p, const tss_ctx *c) {
     for (int b = 0; b < p->bodies; b++) self_off[b] = (uint8_t)tss__ipc_self_off(p, b);
     memset(&m, 0, sizeof m);
     m.dim = c->dim, m.nodes = c->nodes;
-    m.points = p->surface.points, m.point = p->surface.point;
-    m.edges = p->surface.edges, m.edge = p->surface.edge;
-    m.tris = p->surface.triangles, m.tri = p->surface.triangle;
+    if (tss__ipc_any_pair(p)) {
+        m.points = p->surface.points, m.point = p->surface.point;
+        m.edges = p->surface.edges, m.edge = p->surface.edge;
+        m.tris = p->surface.triangles, m.tri = p->surface.triangle;
+    }
     m.kinematic = kinematic, m.body = body, m.self_off = self_off;
     return tss__broad_set_mesh(&p->broad, &m);
 }

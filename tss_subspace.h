@@ -2639,7 +2639,6 @@ static int tss__bisect_metis(int n, const int64_t *ptr, const int *adj, const do
     for (int i = 0; i < n; i++) part[i] = (int)out[i];
     return 1;
 }
-#endif
 
 // Graph of nodes that share a cell, both directions, sorted: ptr (n + 1) and adj, in s->scratch.
 static tss_result tss__sub_graph(tss_subspace *s, int n, int cells, const int *cell, int first, int64_t **ptr,
@@ -2678,6 +2677,7 @@ static tss_result tss__sub_graph(tss_subspace *s, int n, int cells, const int *c
     *ptr = from, *adj = merged;
     return TSS_OK;
 }
+#endif
 
 // Numbers the groups of one body's nodes into part (nodes).
 static tss_result tss__sub_partition(tss_subspace *s, const tss__modal *m, const double *v, int parts, int *part) {
