@@ -16,9 +16,10 @@
  * Contact is two energies (barrier, friction) on the public hook of tss.h; the distances, the
  * barrier and the collision detection below can be called on their own.
  *
- * Options (docs/leave_out.md has what each saves):
- *     TSS_NO_FRICTION  no friction; tss_ipc_add refuses mu > 0.
- *     TSS_NO_3D        no edge-edge and point-triangle pairs; the queries below answer NaN to them.
+ * Options:
+ *     TSS_NO_FRICTION  no friction (4 kB); tss_ipc_add refuses mu > 0.
+ *     TSS_NO_3D        no edge–edge and point–triangle pairs: the queries of single pairs below
+ *                      answer NaN to them, and the CCD 0.
  *     TSS_NO_SIMD      no intrinsics: plain loops, a slower search.
  * Memory, threads, determinism, errors: as in tss.h. License: MIT (at the end).
  */
