@@ -36,6 +36,19 @@
  *     TSS_NO_LAPACK  accepted and without effect: the dense kernels are built in. Debian's serial
  *                    OpenBLAS returned wrong products when called from several threads at once,
  *                    and a threaded BLAS changes bits with the number of threads.
+ * Features, left out in the same way. They save object code (of 598 kB with all three headers, -O2,
+ * x86-64) and no time: what a scene does not use costs none (docs/leave_out.md). What is left keeps
+ * its bits. `tss check SCENE` names those that a scene can do without.
+ *     TSS_NO_2D         23 kB  worlds of 3D only; tss_world_create refuses dim = 2, and logs why.
+ *     TSS_NO_3D        101 kB  worlds of 2D only; likewise, and no membranes and hinges.
+ *     TSS_NO_MATERIALS  20 kB  Neo-Hookean only; tss_body_add refuses other densities, yours too.
+ *     TSS_NO_DAMPING    15 kB  no stiffness-proportional damping; tss_body_add refuses damping > 0.
+ *     TSS_NO_THIN       29 kB  no membranes, hinges and springs; their functions refuse and log why.
+ *     TSS_NO_FRICTION    4 kB  tss_ipc_add refuses mu > 0.
+ *     TSS_NO_EIGEN      37 kB  tss_basis_add refuses bases that solve for their modes.
+ *     A header not included: tss_ipc.h 179 kB, tss_subspace.h 136 kB.
+ *
+ * And:
  *     TSS_ALLOW_FAST_MATH  compile under -ffast-math all the same; nothing is promised then.
  *     TSS_ASSERT(c)  what to do about a caller's bug; default assert.
  *     TSS_API        linkage of public functions; default extern.
@@ -957,6 +970,65 @@ extern "C" {
 #endif
 
 // ---------------------------------------------------------------------------------------------
+// >>features (private)
+// What a TSS_NO_* leaves out hangs on a condition that is a constant here: the compiler drops the
+// code behind it, no #if stands inside the sections, and every line is compiled in every build.
+// What is asked for all the same is refused by name, in tss_world_create and tss_body_add.
+// ---------------------------------------------------------------------------------------------
+
+#if defined(TSS_NO_2D) && defined(TSS_NO_3D)
+#error "TSS_NO_2D and TSS_NO_3D together leave nothing to simulate"
+#endif
+
+#if defined(TSS_NO_2D)
+#define TSS__DIM(dim) ((void)(dim), 3)
+#elif defined(TSS_NO_3D)
+#define TSS__DIM(dim) ((void)(dim), 2)
+#else
+#define TSS__DIM(dim) (dim)
+#endif
+
+#ifdef TSS_NO_MATERIALS
+#define TSS__KIND(kind) ((void)(kind), TSS_NEO_HOOKEAN)
+#else
+#define TSS__KIND(kind) (kind)
+#endif
+
+#ifdef TSS_NO_DAMPING
+#define TSS__DAMPING(seconds) ((void)(seconds), 0.0)
+#else
+#define TSS__DAMPING(seconds) (seconds)
+#endif
+
+#ifdef TSS_NO_THIN
+#define TSS__THIN 0
+#else
+#define TSS__THIN 1
+#endif
+#define TSS__THIN_3D (TSS__THIN && TSS__DIM(3) == 3)
+
+// The switch that leaves out worlds of this dimension, this material, or thin energies of this
+// dimension; NULL: none does.
+static const char *tss__dim_left_out(int dim) {
+    const int kept = TSS__DIM(dim);
+    return kept == dim ? NULL : dim == 2 ? "TSS_NO_2D" : "TSS_NO_3D";
+}
+
+static const char *tss__material_left_out(const tss_material *m) {
+    if (TSS__KIND(m->kind) == TSS_NEO_HOOKEAN && m->kind != TSS_NEO_HOOKEAN) return "TSS_NO_MATERIALS";
+    return m->damping > 0 && !(TSS__DAMPING(m->damping) > 0) ? "TSS_NO_DAMPING" : NULL;
+}
+
+static const char *tss__thin_left_out(int dim) {
+    return TSS__THIN ? tss__dim_left_out(dim) : "TSS_NO_THIN";
+}
+
+static tss_result tss__refuse(const tss_host *host, const char *what, const char *left_out_by) {
+    tss_log(host, TSS_LOG_ERROR, "%s: left out of this build by %s", what, left_out_by);
+    return TSS_ERROR_BAD_ARGUMENT;
+}
+
+// ---------------------------------------------------------------------------------------------
 // >>host (private)
 // ---------------------------------------------------------------------------------------------
 
@@ -1608,7 +1680,7 @@ TSS__INLINE void tss__jacobi_sweeps(int d, int tiles, tss__jacobi *j) {
 }
 
 TSS__STAGE void tss__jacobi_run(int d, int tiles, tss__jacobi *j) {
-    if (d == 2)
+    if (TSS__DIM(d) == 2)
         tss__jacobi_sweeps(2, tiles, j);
     else if (tiles == TSS__SVD_TILES)
         tss__jacobi_sweeps(3, TSS__SVD_TILES, j);
@@ -1636,7 +1708,7 @@ TSS__STAGE void tss__svd(int d, int tiles, tss__lanes *const *F, tss__svd_parts 
     tss__jacobi_run(d, tiles, &j);
     for (int i = 0; i < tiles; i++) {
         memcpy(o[i]->V, j.V[i], (size_t)(d * d) * sizeof(tss__lanes));
-        if (d == 3)
+        if (TSS__DIM(d) == 3)
             tss__svd_finish(3, j.A[i], o[i]);
         else
             tss__svd_finish(2, j.A[i], o[i]);
@@ -1959,7 +2031,7 @@ TSS__INLINE void tss__tile_F_in(int d, const tss__elastic *e, const double *x, t
 }
 
 TSS__STAGE void tss__tile_F(int d, const tss__elastic *e, const double *x, tss__tile *t) {
-    if (d == 3)
+    if (TSS__DIM(d) == 3)
         tss__tile_F_in(3, e, x, t);
     else
         tss__tile_F_in(2, e, x, t);
@@ -2077,8 +2149,9 @@ static int tss__some_tiles(const tss__elastic *e, const double *x, const tss_ids
         tss__tile_F(e->dim, e, x, t + g);
         F[g] = t[g].F, parts[g] = &h[g].f;
     }
-    if (e->material.kind != TSS_LINEAR) tss__svd(e->dim, tiles, F, parts);
-    for (int g = 0; g < tiles; g++) tss__tile_stretch(e->dim, e->material.kind, psd, t + g, h + g);
+    const tss_material_kind kind = TSS__KIND(e->material.kind);
+    if (kind != TSS_LINEAR) tss__svd(e->dim, tiles, F, parts);
+    for (int g = 0; g < tiles; g++) tss__tile_stretch(e->dim, kind, psd, t + g, h + g);
     return tiles;
 }
 
@@ -2172,7 +2245,7 @@ TSS__INLINE void tss__assemble_in(int d, int edges, tss__lanes *b, tss__stretch 
 }
 
 TSS__STAGE void tss__assemble(int d, int edges, tss__lanes *b, tss__stretch *h, tss__lanes *W) {
-    if (d == 2)
+    if (TSS__DIM(d) == 2)
         tss__assemble_in(2, 2, b, h, W);
     else if (edges == 3)
         tss__assemble_in(3, 3, b, h, W);
@@ -2183,7 +2256,7 @@ TSS__STAGE void tss__assemble(int d, int edges, tss__lanes *b, tss__stretch *h, 
 // b̂ = Vᵀ∇N, then all blocks.
 TSS__STAGE void tss__tile_assemble(int d, tss__tile *t, tss__stretch *h, tss__lanes *W) {
     TSS__ALIGN tss__lanes b[9];
-    if (d == 3)
+    if (TSS__DIM(d) == 3)
         tss__mul(3, t->inv, h->f.V, 0, b);
     else
         tss__mul(2, t->inv, h->f.V, 0, b);
@@ -2370,7 +2443,7 @@ TSS__INLINE void tss__value_tiles(int d, const tss__elastic *e, const double *x,
         TSS__ALIGN tss__lanes psi;
         tss__tile_cells(e, ids, at, &t);
         tss__tile_F(d, e, x, &t);
-        tss__tile_psi(d, e->material.kind, &t, psi);
+        tss__tile_psi(d, TSS__KIND(e->material.kind), &t, psi);
         for (int l = 0; l < t.used; l++) out[at + l] = psi[l];
     }
 }
@@ -2383,7 +2456,7 @@ TSS__INLINE void tss__gradient_tiles(int d, const tss__elastic *e, const double 
         TSS__ALIGN tss__lanes G[12];
         tss__tile_cells(e, ids, at, &t);
         tss__tile_F(d, e, x, &t);
-        tss__tile_P(d, e->material.kind, &t, P);
+        tss__tile_P(d, TSS__KIND(e->material.kind), &t, P);
         tss__tile_forces(d, &t, P, G);
         tss__tile_scatter(d * (d + 1), t.used, G, out + at * d * (d + 1));
     }
@@ -2422,9 +2495,9 @@ static void tss__elastic_value(void *user, const tss_ctx *c, const double *x, ts
                                double *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c;
-    if (e->material.kind == TSS_CUSTOM_MATERIAL)
+    if (TSS__KIND(e->material.kind) == TSS_CUSTOM_MATERIAL)
         tss__custom_value(e, x, ids, out);
-    else if (e->dim == 3)
+    else if (TSS__DIM(e->dim) == 3)
         tss__value_3(e, x, &ids, out);
     else
         tss__value_2(e, x, &ids, out);
@@ -2434,9 +2507,9 @@ static void tss__elastic_gradient(void *user, const tss_ctx *c, const double *x,
                                   double *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c;
-    if (e->material.kind == TSS_CUSTOM_MATERIAL)
+    if (TSS__KIND(e->material.kind) == TSS_CUSTOM_MATERIAL)
         tss__custom_gradient(e, x, ids, out);
-    else if (e->dim == 3)
+    else if (TSS__DIM(e->dim) == 3)
         tss__gradient_3(e, x, &ids, out);
     else
         tss__gradient_2(e, x, &ids, out);
@@ -2446,7 +2519,7 @@ static void tss__elastic_hessian(void *user, const tss_ctx *c, const double *x, 
                                  int psd, double *out) {
     const tss__elastic *e = (const tss__elastic *)user;
     (void)c;
-    if (e->material.kind == TSS_CUSTOM_MATERIAL)
+    if (TSS__KIND(e->material.kind) == TSS_CUSTOM_MATERIAL)
         tss__custom_hessian(e, x, ids, psd, out);
     else
         tss__hessian_tiles(e, x, &ids, psd, out);
@@ -2636,7 +2709,7 @@ static void tss__filter_run(int block, int worker, void *arg) {
         TSS__ALIGN tss__cubic p;
         const double T = limit;
         tss__tile_cells(e, &ids, at, &t);
-        if (e->dim == 3) {
+        if (TSS__DIM(e->dim) == 3) {
             tss__tile_edges(3, e->node, f->x, t.id, t.D);
             tss__tile_edges(3, e->node, f->d, t.id, B);
             tss__cubic3(t.D, B, T, &p);
@@ -2685,7 +2758,7 @@ static void tss__min_J_run(int block, int worker, void *arg) {
         TSS__ALIGN tss__lanes C[9];
         TSS__ALIGN tss__lanes J;
         tss__tile_cells(e, &ids, at, &t);
-        if (e->dim == 3)
+        if (TSS__DIM(e->dim) == 3)
             tss__tile_F(3, e, f->x, &t), tss__cofactor(3, t.F, C, J);
         else
             tss__tile_F(2, e, f->x, &t), tss__cofactor(2, t.F, C, J);
@@ -3027,7 +3100,7 @@ TSS__INLINE void tss__damping_gradient_tiles(int d, const tss__damping *m, const
 static void tss__damping_value(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                double *out) {
     const tss__damping *m = (const tss__damping *)user;
-    if (m->e->dim == 3)
+    if (TSS__DIM(m->e->dim) == 3)
         tss__damping_value_tiles(3, m, c, x, &ids, out);
     else
         tss__damping_value_tiles(2, m, c, x, &ids, out);
@@ -3036,7 +3109,7 @@ static void tss__damping_value(void *user, const tss_ctx *c, const double *x, ts
 static void tss__damping_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids,
                                   double *out) {
     const tss__damping *m = (const tss__damping *)user;
-    if (m->e->dim == 3)
+    if (TSS__DIM(m->e->dim) == 3)
         tss__damping_gradient_tiles(3, m, c, x, &ids, out);
     else
         tss__damping_gradient_tiles(2, m, c, x, &ids, out);
@@ -3382,6 +3455,7 @@ tss_result tss_membrane_energy(const tss_host *host, const tss_membrane_def *def
     if (!def || !out || !host || def->triangles < 1 || !def->X || !(def->thickness > 0) ||
         !tss__nodes_ok(def->node, (size_t)def->triangles * 3))
         return TSS_ERROR_BAD_ARGUMENT;
+    if (!TSS__THIN_3D) return tss__refuse(host, "membranes", tss__thin_left_out(3));
     const tss_material *mat = &def->material;
     if ((mat->kind != TSS_STVK && mat->kind != TSS_NEO_HOOKEAN) ||
         !tss__material_ok(mat->E, mat->nu, mat->rho))
@@ -3625,6 +3699,7 @@ tss_result tss_hinge_energy(const tss_host *host, const tss_hinge_def *def, tss_
     if (!host || !def || !out || def->hinges < 1 || !def->X || !(def->stiffness > 0) ||
         !tss__nodes_ok(def->node, (size_t)def->hinges * 4))
         return TSS_ERROR_BAD_ARGUMENT;
+    if (!TSS__THIN_3D) return tss__refuse(host, "hinges", tss__thin_left_out(3));
     tss__hinges *e = tss__hinges_alloc(host, def->hinges);
     if (!e) return TSS_ERROR_NO_MEMORY;
     memcpy(e->node, def->node, (size_t)def->hinges * 4 * sizeof *e->node);
@@ -3777,6 +3852,8 @@ tss_result tss_spring_energy(const tss_host *host, const tss_spring_def *def, ts
     if (!host || !def || !out || def->springs < 1 || (def->dim != 2 && def->dim != 3) ||
         (!def->X && !def->rest_length) || !tss__nodes_ok(def->node, (size_t)def->springs * 2))
         return TSS_ERROR_BAD_ARGUMENT;
+    if (!TSS__THIN || tss__thin_left_out(def->dim))
+        return tss__refuse(host, "springs", tss__thin_left_out(def->dim));
     tss__springs *e = tss__springs_alloc(host, def->springs, def->dim);
     if (!e) return TSS_ERROR_NO_MEMORY;
     memcpy(e->node, def->node, (size_t)def->springs * 2 * sizeof *e->node);
@@ -7617,6 +7694,9 @@ static tss_result tss__check_body(tss_world *w, const char *name, const tss_body
     double damping = d->material.damping;
     if (!(damping >= 0) || !isfinite(damping))
         return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: damping = %g s, expected >= 0", name, damping);
+    const char *left_out = d->cells > 0 ? tss__material_left_out(&d->material) : NULL;
+    if (left_out)
+        return tss_world_fail(w, TSS_ERROR_BAD_MATERIAL, "%s: its material is left out of this build by %s", name, left_out);
     if ((r = tss__check_volumes(w, name, d)) != TSS_OK) return r;
     if (d->kind == TSS_BODY_SOFT && (r = tss__check_materials(w, name, d)) != TSS_OK) return r;
     return tss__check_referenced(w, name, d);
@@ -8382,7 +8462,7 @@ static tss_result tss__elastic_make(tss_world *w, const tss__bodydata *lead, con
         tss__elastic_destroy(ref->e, &w->host);
         return r;
     }
-    if (lead->material.damping <= 0) return TSS_OK;
+    if (TSS__DAMPING(lead->material.damping) <= 0) return TSS_OK;
     r = tss__damping_create(&w->host, ref->e, &d);
     if (r != TSS_OK) return tss_world_fail(w, r, "damping of %s: %s", lead->name, tss_result_text(r));
     r = tss_energy_add(w, &d, &ref->damping);
@@ -8584,6 +8664,8 @@ tss_result tss_world_create(const tss_world_def *def, tss_world **out) {
     if (!out) return TSS_ERROR_BAD_ARGUMENT;
     *out = NULL;
     if (!def || !tss__world_def_ok(def)) return TSS_ERROR_BAD_ARGUMENT;
+    const char *left_out = tss__dim_left_out(def->dim);
+    if (left_out) return tss__refuse(&def->host, def->dim == 2 ? "dim = 2" : "dim = 3", left_out);
     tss_world *w = (tss_world *)tss_alloc(&def->host, sizeof *w);
     if (!w) return TSS_ERROR_NO_MEMORY;
     memset(w, 0, sizeof *w);
@@ -10245,7 +10327,7 @@ struct tss_embedding {
 
 // Barycentric coordinates of p in a cell; returns the smallest.
 static double tss__barycentric(int dim, const double *X, const int *c, const double *p, double *w) {
-    double whole = tss__cell_volume(dim, X, c), least = INFINITY, Y[12];
+    double whole = tss__cell_volume(dim, X, c), least = INFINITY, Y[12] = {0};
     int id[4] = {0, 1, 2, 3};
     for (int k = 0; k <= dim; k++) {
         for (int i = 0; i <= dim; i++)

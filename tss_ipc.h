@@ -16,7 +16,11 @@
  * Contact is two energies (barrier, friction) on the public hook of tss.h; the distances, the
  * barrier and the collision detection below can be called on their own.
  *
- * Options: TSS_NO_SIMD  no intrinsics: plain loops, a slower search
+ * Options:
+ *     TSS_NO_FRICTION  no friction (4 kB); tss_ipc_add refuses mu > 0.
+ *     TSS_NO_3D        no edge–edge and point–triangle pairs: the queries of single pairs below
+ *                      answer NaN to them, and the CCD 0.
+ *     TSS_NO_SIMD      no intrinsics: plain loops, a slower search.
  * Memory, threads, determinism, errors: as in tss.h. License: MIT (at the end).
  */
 #ifndef TSS_IPC_H
@@ -278,6 +282,27 @@ extern "C" {
 #endif
 
 // ---------------------------------------------------------------------------------------------
+// >>contact_features (private)
+// What a TSS_NO_* leaves out hangs on a condition that is a constant here, as in tss.h, >>features.
+// ---------------------------------------------------------------------------------------------
+
+#ifdef TSS_NO_FRICTION
+#define TSS__FRICTION 0
+#else
+#define TSS__FRICTION 1
+#endif
+
+// The kinds of pairs that there are: two in 2D.
+#ifdef TSS_NO_3D
+#define TSS__IPC_3D 0
+#define TSS__IPC_KIND(kind) \
+    ((kind) == TSS_IPC_POINT_POINT ? TSS_IPC_POINT_POINT : TSS_IPC_POINT_EDGE)
+#else
+#define TSS__IPC_3D 1
+#define TSS__IPC_KIND(kind) (kind)
+#endif
+
+// ---------------------------------------------------------------------------------------------
 // >>contact_vectors (private)
 // Three numbers by value: the compiler keeps them in registers, and in lanes of vectors.
 // ---------------------------------------------------------------------------------------------
@@ -425,9 +450,13 @@ TSS__INLINE tss__near tss__near_ee(tss__v3 a0, tss__v3 a1, tss__v3 b0, tss__v3 b
 }
 
 // The four points of a pair in space (z = 0 in 2D; the places a pair does not have repeat its
-// last).
+// last). Not a number for what TSS_NO_3D leaves out: the public queries answer with that.
 static void tss__pair_load(tss_ipc_kind kind, int dim, const double *x, tss__v3 v[4]) {
     int m = tss_ipc_pair_nodes(kind);
+    if (!TSS__IPC_3D && (dim == 3 || m == 4)) {
+        v[0] = v[1] = v[2] = v[3] = tss__v3_of(NAN, NAN, NAN);
+        return;
+    }
     for (int i = 0; i < 4; i++) {
         const double *p = x + (i < m ? i : m - 1) * dim;
         v[i] = tss__v3_of(p[0], p[1], dim == 3 ? p[2] : 0);
@@ -435,7 +464,7 @@ static void tss__pair_load(tss_ipc_kind kind, int dim, const double *x, tss__v3 
 }
 
 static tss__near tss__near_of(tss_ipc_kind kind, const tss__v3 v[4]) {
-    switch (kind) {
+    switch (TSS__IPC_KIND(kind)) {
         case TSS_IPC_EDGE_EDGE:
             return tss__near_ee(v[0], v[1], v[2], v[3]);
         case TSS_IPC_POINT_TRIANGLE:
@@ -1035,7 +1064,7 @@ TSS__INLINE void tss__lanes_near(int kind, tss__lane *TSS__RESTRICT v,
 
 static void tss__eight_closest(tss_ipc_kind kind, tss__lane *TSS__RESTRICT v,
                                tss__eight_near *TSS__RESTRICT o) {
-    switch (kind) {
+    switch (TSS__IPC_KIND(kind)) {
         case TSS_IPC_EDGE_EDGE:
             tss__lanes_near(TSS_IPC_EDGE_EDGE, v, o);
             break;
@@ -1059,7 +1088,7 @@ TSS__INLINE void tss__lanes_distance(int kind, tss__lane *TSS__RESTRICT v,
 // Squared distances alone: what value and the search for active pairs need.
 static void tss__eight_distance(tss_ipc_kind kind, tss__lane *TSS__RESTRICT v,
                                 double *TSS__RESTRICT d) {
-    switch (kind) {
+    switch (TSS__IPC_KIND(kind)) {
         case TSS_IPC_EDGE_EDGE:
             tss__lanes_distance(TSS_IPC_EDGE_EDGE, v, d);
             break;
@@ -1085,7 +1114,7 @@ static int tss__eight_active(const tss__eight *e, const double *d) {
 // Mollifier of edge–edge lanes: m and m′ by c (1 and 0 for the other kinds).
 static void tss__eight_mollify(const tss__eight *e, tss__lane *v, double *m, double *m1) {
     tss__lane V[12];
-    if (e->kind != TSS_IPC_EDGE_EDGE) {
+    if (TSS__IPC_KIND(e->kind) != TSS_IPC_EDGE_EDGE) {
         for (int l = 0; l < TSS__LANES; l++) m[l] = 1, m1[l] = 0;
         return;
     }
@@ -1409,7 +1438,7 @@ static void tss__lane_exact(const tss__eight *e, tss__lane *v, int feature, int 
     tss__barrier b = tss__barrier_of(f.d, e->dhat);
     memset(H, 0, 144 * sizeof *H);
     tss__frame_gradient(&f, g);
-    if (e->kind == TSS_IPC_EDGE_EDGE) {
+    if (TSS__IPC_KIND(e->kind) == TSS_IPC_EDGE_EDGE) {
         const int *node = e->node[l];
         tss__v3 V[4];
         for (int i = 0; i < 4; i++) {
@@ -1520,7 +1549,7 @@ static void tss__eight_hessian(const tss__eight *e, int psd) {
     }
     if (!psd) return;
     if (plains) tss__eight_projected(e, v, &n, plain);
-    if (mollifieds) tss__eight_mollified(e, v, &n, mollified);
+    if (TSS__IPC_3D && mollifieds) tss__eight_mollified(e, v, &n, mollified);
 }
 
 #ifdef __cplusplus
@@ -2545,7 +2574,7 @@ static inline int tss__broad_row(const tss__broad_tree *t, const int *list, int 
 
 static int tss__broad_row_of(int kind, const tss__broad_tree *t, const int *list, int count,
                              const tss__broad_query *q, int *leaves, int *row) {
-    switch (kind) {
+    switch (TSS__IPC_3D || kind == TSS__BROAD_PP ? kind : TSS__BROAD_PE) {
         case TSS__BROAD_EE: return tss__broad_row(t, list, count, q, 2, 2, leaves, row);
         case TSS__BROAD_PT: return tss__broad_row(t, list, count, q, 1, 3, leaves, row);
         case TSS__BROAD_PE: return tss__broad_row(t, list, count, q, 1, 2, leaves, row);
@@ -2935,7 +2964,7 @@ static void tss__broad_triangles(tss__broad_lanes *g) {
 }
 
 static inline void tss__broad_closest(int kind, tss__broad_lanes *g) {
-    if (kind == TSS__BROAD_PT) tss__broad_triangles(g);
+    if (TSS__IPC_3D && kind == TSS__BROAD_PT) tss__broad_triangles(g);
     else tss__broad_segments(g);
 }
 
@@ -3196,7 +3225,7 @@ static inline void tss__broad_advance_as(int triangle, const tss__broad_lanes *g
 
 static void tss__broad_advance(const tss__broad_lanes *g, int kind, double slack, double least,
                                tss__broad_front *f) {
-    if (kind == TSS__BROAD_PT) tss__broad_advance_as(1, g, slack, least, f);
+    if (TSS__IPC_3D && kind == TSS__BROAD_PT) tss__broad_advance_as(1, g, slack, least, f);
     else tss__broad_advance_as(0, g, slack, least, f);
 }
 
@@ -3529,6 +3558,15 @@ static int tss__ipc_excludes(const tss_ipc *p) {
     return 0;
 }
 
+// Are there two primitives that may meet? Not where one body is alone and does not meet itself: the
+// broad phase then gets nothing to do.
+static int tss__ipc_any_pair(const tss_ipc *p) {
+    const int *body = (const int *)p->body_of.p, *point = p->surface.point;
+    for (int i = 1; i < p->surface.points; i++)
+        if (body[point[i]] != body[point[0]]) return 1;
+    return p->surface.points > 0 && !((const uint8_t *)p->self_off.p)[body[point[0]]];
+}
+
 // The surface as the broad phase wants it. Its arrays are copies where they must outlive a call.
 static tss_result tss__ipc_set_mesh(tss_ipc *p, const tss_ctx *c) {
     tss__broad_mesh m;
@@ -3546,9 +3584,11 @@ static tss_result tss__ipc_set_mesh(tss_ipc *p, const tss_ctx *c) {
     for (int b = 0; b < p->bodies; b++) self_off[b] = (uint8_t)tss__ipc_self_off(p, b);
     memset(&m, 0, sizeof m);
     m.dim = c->dim, m.nodes = c->nodes;
-    m.points = p->surface.points, m.point = p->surface.point;
-    m.edges = p->surface.edges, m.edge = p->surface.edge;
-    m.tris = p->surface.triangles, m.tri = p->surface.triangle;
+    if (tss__ipc_any_pair(p)) {
+        m.points = p->surface.points, m.point = p->surface.point;
+        m.edges = p->surface.edges, m.edge = p->surface.edge;
+        m.tris = p->surface.triangles, m.tri = p->surface.triangle;
+    }
     m.kinematic = kinematic, m.body = body, m.self_off = self_off;
     return tss__broad_set_mesh(&p->broad, &m);
 }
@@ -4311,14 +4351,14 @@ static double tss__ipc_mu_of(const tss_ipc *p, const tss__ipc_touching *t) {
     return s && s->mu >= 0 ? s->mu : p->plane[t->plane].mu;
 }
 
-static int tss__ipc_any_friction(const tss_ipc *p) {
-    if (p->def.mu > 0) return 1;
-    for (int i = 0; i < p->def.planes; i++)
-        if (p->plane[i].mu > 0) return 1;
-    for (int i = 0; i < p->def.bodies; i++)
-        if (p->body[i].mu > 0) return 1;
-    for (int i = 0; i < p->def.pairs; i++)
-        if (p->pair[i].mu > 0) return 1;
+static int tss__ipc_any_friction(const tss_ipc_def *d) {
+    if (d->mu > 0) return 1;
+    for (int i = 0; i < d->planes; i++)
+        if (d->plane[i].mu > 0) return 1;
+    for (int i = 0; i < d->bodies; i++)
+        if (d->body[i].mu > 0) return 1;
+    for (int i = 0; i < d->pairs; i++)
+        if (d->pair[i].mu > 0) return 1;
     return 0;
 }
 
@@ -4332,7 +4372,7 @@ static void tss__ipc_key(const tss__ipc_list *l, int id, int key[3]) {
 static tss_result tss__ipc_lag(tss_ipc *p, const tss_ctx *c, const double *x) {
     int count = p->active.start[TSS__IPC_KINDS], arity = tss__ipc_arity(c->dim);
     p->frictions = 0, p->f_pattern++;
-    if (!tss__ipc_any_friction(p) || !count) return TSS_OK;
+    if (!tss__ipc_any_friction(&p->def) || !count) return TSS_OK;
     int *node = (int *)tss__ipc_fit(p->host, &p->f_node, (size_t)(count * arity) * sizeof(int));
     int *key = (int *)tss__ipc_fit(p->host, &p->f_key, (size_t)count * 3 * sizeof(int));
     double *data = (double *)tss__ipc_fit(p->host, &p->f_data, (size_t)count * 8 * sizeof(double));
@@ -4498,7 +4538,7 @@ static tss_result tss__ipc_begin_step(void *user, const tss_ctx *c) {
     // be wrong by the ratio of the two, and a block at the limit of friction would slide.
     int first = !(p->kappa > 0);
     if (r == TSS_OK && first) r = tss__ipc_start_kappa(p, c);
-    if (r == TSS_OK) r = tss__ipc_lag(p, c, c->x_t);
+    if (r == TSS_OK && TSS__FRICTION) r = tss__ipc_lag(p, c, c->x_t);
     if (r == TSS_OK) r = tss__ipc_gather_touches(p, c, c->x_t, &p->touch, &p->touches);
     if (r == TSS_OK && !first) r = tss__ipc_start_kappa(p, c);
     return r;
@@ -4506,7 +4546,8 @@ static tss_result tss__ipc_begin_step(void *user, const tss_ctx *c) {
 
 static int tss__ipc_after_solve(void *user, const tss_ctx *c, const double *x) {
     tss_ipc *p = (tss_ipc *)user;
-    if (++p->passes >= p->def.friction_iterations || !tss__ipc_any_friction(p)) return 0;
+    if (!TSS__FRICTION || ++p->passes >= p->def.friction_iterations || !tss__ipc_any_friction(&p->def))
+        return 0;
     if (tss__ipc_find_active(p, c, x, 0) != TSS_OK || tss__ipc_lag(p, c, x) != TSS_OK) {
         p->failed = 1;
         return 0;
@@ -4956,6 +4997,10 @@ tss_result tss_ipc_add(tss_world *w, const tss_ipc_def *def, tss_ipc **out) {
     int dim = tss_world_dim(w);
     const char *fault = tss__ipc_def_fault(def, dim);
     if (fault) return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT, "contact: %s", fault);
+    int friction = tss__ipc_any_friction(def);
+    if (friction && !TSS__FRICTION)
+        return tss_world_fail(w, TSS_ERROR_BAD_ARGUMENT,
+                              "contact: mu > 0, but friction is left out of this build by TSS_NO_FRICTION");
     tss_ipc *p;
     tss_result r = tss__ipc_create(w, def, dim, &p);
     if (r != TSS_OK) return tss_world_fail(w, r, "contact: %s", tss_result_text(r));
@@ -4968,8 +5013,10 @@ tss_result tss_ipc_add(tss_world *w, const tss_ipc_def *def, tss_ipc **out) {
         return r;
     }
     p->references = 1;
-    e = tss__ipc_friction_def(p, dim);
-    r = tss__ipc_any_friction(p) ? tss_energy_add(w, &e, &p->friction) : TSS_OK;
+    if (TSS__FRICTION && friction) {
+        e = tss__ipc_friction_def(p, dim);
+        r = tss_energy_add(w, &e, &p->friction);
+    }
     if (r != TSS_OK) {
         tss_energy_remove(w, p->barrier);
         return r;

@@ -18,8 +18,11 @@
  *
  * Memory: a skinning basis keeps nodes × handles doubles; every subdomain a secant matrix of
  * (active modes)². Threads, determinism, errors: as in tss.h. Setup (partition, modes) happens in
- * tss_basis_add and the first step. Options: those of tss.h; TSS_SUBSPACE_DEBUG checks in every
- * iterate that the coupled matrix is positive definite. License: MIT (at the end).
+ * tss_basis_add and the first step. License: MIT (at the end).
+ * Options: those of tss.h;
+ *     TSS_NO_EIGEN  no bases that solve for their modes: skinning, biharmonic, eigen, POD, and no
+ *                   cache files (37 kB); tss_basis_add refuses them.
+ *     TSS_SUBSPACE_DEBUG  checks in every iterate that the coupled matrix is positive definite.
  *
  * CONVENTIONS
  *     U: all modes of a body, U_a the active ones, B_a = S'U_a those masked at enriched nodes;
@@ -259,6 +262,12 @@ extern "C" {
 // their sum, stiffnesses by a power of two. So results do not depend on the place of the body, and
 // not in a single bit on powers of two in its size, mass and stiffness.
 // ---------------------------------------------------------------------------------------------
+
+#ifdef TSS_NO_EIGEN  // what that leaves out hangs on this constant, as in tss.h, >>features
+#define TSS__EIGEN 0
+#else
+#define TSS__EIGEN 1
+#endif
 
 #define TSS__BASIS_COOKIE 0x626173  // proves that a def came from its default function
 
@@ -2201,6 +2210,12 @@ static tss_result tss__basis_check_mesh(tss__basis_work *w) {
     return TSS_OK;
 }
 
+// Kinds whose setup solves for their modes.
+static int tss__basis_solves(tss_basis_kind kind) {
+    return kind == TSS_BASIS_SKINNING || kind == TSS_BASIS_BIHARMONIC || kind == TSS_BASIS_EIGEN ||
+           kind == TSS_BASIS_POD;
+}
+
 static tss_result tss__basis_check_def(tss__basis_work *w) {
     const tss_basis_def *d = w->def;
     if (d->cookie != TSS__BASIS_COOKIE)
@@ -2209,6 +2224,9 @@ static tss_result tss__basis_check_def(tss__basis_work *w) {
                                "or one of its sisters");
     if ((unsigned)d->kind >= TSS_BASIS_KINDS)
         return tss__basis_fail(w, TSS_ERROR_BAD_ARGUMENT, "no basis of kind %d", (int)d->kind);
+    if (!TSS__EIGEN && tss__basis_solves(d->kind))
+        return tss__basis_fail(w, TSS_ERROR_BAD_ARGUMENT,
+                               "bases of this kind are left out of this build by TSS_NO_EIGEN");
     if (d->count < 1)
         return tss__basis_fail(w, TSS_ERROR_BAD_ARGUMENT, "count is %d, expected at least 1",
                                d->count);
@@ -2272,6 +2290,10 @@ static tss_result tss__basis_check_arrays(tss__basis_work *w) {
 }
 
 static tss_result tss__basis_build_kind(tss__basis_work *w, tss__basis *b) {
+    if (!TSS__EIGEN)
+        return w->def->kind == TSS_BASIS_AFFINE      ? tss__basis_build_affine(w, b)
+               : w->def->kind == TSS_BASIS_QUADRATIC ? tss__basis_build_quadratic(w, b)
+                                                     : tss__basis_build_given(w, b);
     switch (w->def->kind) {
         case TSS_BASIS_AFFINE: return tss__basis_build_affine(w, b);
         case TSS_BASIS_QUADRATIC: return tss__basis_build_quadratic(w, b);
@@ -2285,9 +2307,7 @@ static tss_result tss__basis_build_kind(tss__basis_work *w, tss__basis *b) {
 
 // From the cache, or built and put there.
 static tss_result tss__basis_make(tss__basis_work *w, tss__basis *b) {
-    tss_basis_kind kind = w->def->kind;
-    int cached = w->def->cache && (kind == TSS_BASIS_SKINNING || kind == TSS_BASIS_BIHARMONIC ||
-                                   kind == TSS_BASIS_EIGEN || kind == TSS_BASIS_POD);
+    int cached = TSS__EIGEN && w->def->cache && tss__basis_solves(w->def->kind);
     if (!cached) return tss__basis_build_kind(w, b);
     uint64_t key = tss__cache_key(w->mesh, w->def);
     if (tss__cache_read(w, b, key)) return TSS_OK;
@@ -2620,7 +2640,6 @@ static int tss__bisect_metis(int n, const int64_t *ptr, const int *adj, const do
     for (int i = 0; i < n; i++) part[i] = (int)out[i];
     return 1;
 }
-#endif
 
 // Graph of nodes that share a cell, both directions, sorted: ptr (n + 1) and adj, in s->scratch.
 static tss_result tss__sub_graph(tss_subspace *s, int n, int cells, const int *cell, int first, int64_t **ptr,
@@ -2659,6 +2678,7 @@ static tss_result tss__sub_graph(tss_subspace *s, int n, int cells, const int *c
     *ptr = from, *adj = merged;
     return TSS_OK;
 }
+#endif
 
 // Numbers the groups of one body's nodes into part (nodes).
 static tss_result tss__sub_partition(tss_subspace *s, const tss__modal *m, const double *v, int parts, int *part) {

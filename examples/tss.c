@@ -15,7 +15,8 @@
    checkpoint.bin and report.html. It ends with the 64-bit hash of positions and velocities: the same
    for any number of threads. --check hands every accepted iterate to an independent judge
    (tests/checker.h). --snapshots keeps positions each K steps, for a basis of kind pod. check is
-   the doctor: it says what is wrong with a scene, and takes no step. modes lists and draws bases.
+   the doctor: it says what is wrong with a scene, which parts of the library the scene uses, and the
+   build that leaves out the others; it takes no step. modes lists and draws bases.
 
    compare --sweep: error against run time over solvers and tolerances, sweep.h.
    compare takes each step from the same state in full space (direct, pcg, auto) and adaptively;
@@ -1418,6 +1419,78 @@ static void check_bases(const run *r) {
         }
 }
 
+static int has_bases(const scene *s) {
+    for (int k = 0; k < s->bodies; k++)
+        if (s->body[k].bases > 0) return 1;
+    return 0;
+}
+
+// What the scene asks of the library, and the build that leaves out the rest (docs/leave_out.md).
+static void print_part(const char *name, int used, const char *why, const char *flag, char *flags,
+                       size_t size) {
+    printf("%s: %s (%s)\n", name, used ? "used" : "not used", why);
+    size_t at = strlen(flags);
+    if (!used && flag) snprintf(flags + at, size - at, " -DTSS_NO_%s", flag);
+}
+
+static int has_friction(const scene *s) {
+    int any = s->contact.mu > 0;
+    for (int k = 0; k < s->bodies; k++) any |= s->body[k].mu > 0;
+    for (int k = 0; k < s->planes; k++) any |= s->plane[k].mu > 0;
+    return s->contact.enabled && any;
+}
+
+// Kinds of what bodies are made of and how they move, as bits.
+enum { OTHER_MATERIAL = 1, DAMPED = 2, BY_CELL = 4, SCRIPTED = 8, BASIS = 16, SOLVED_BASIS = 32 };
+
+static int traits(const scene *s) {
+    int all = s->script != SCENE_SCRIPT_NONE ? SCRIPTED : 0;
+    for (int k = 0; k < s->bodies; k++) {
+        const scene_body *b = &s->body[k];
+        if (b->motion.moves) all |= SCRIPTED;
+        for (int i = 0; i < b->pins; i++)
+            if (b->pin[i].motion.moves) all |= SCRIPTED;
+        if (b->obstacle) continue;
+        if (b->material.kind != TSS_NEO_HOOKEAN) all |= OTHER_MATERIAL;
+        if (b->material.damping > 0) all |= DAMPED;
+        if (b->E || b->nu) all |= BY_CELL;
+        for (int i = 0; i < b->bases && scene_mode(s) != TSS_MODE_FULL; i++) {
+            int kind = b->basis[i].kind;
+            all |= kind == TSS_BASIS_AFFINE || kind == TSS_BASIS_QUADRATIC ? BASIS : BASIS | SOLVED_BASIS;
+        }
+    }
+    return all;
+}
+
+static void print_parts(const scene *s) {
+    const int contact = s->contact.enabled, friction = has_friction(s), all = traits(s), flat = s->world.dim == 2;
+    const char *full = has_bases(s) ? "solver.mode is full" : "no body has a basis";
+    char flags[400] = "";
+    print_part("2D", flat, flat ? "world.dim is 2" : "world.dim is 3", "2D", flags, sizeof flags);
+    print_part("3D", !flat, flat ? "world.dim is 2" : "world.dim is 3", "3D", flags, sizeof flags);
+    print_part("contact", contact, contact ? "contact.enabled" : "contact.enabled is false", NULL, flags, sizeof flags);
+    print_part("self-contact", contact && s->contact.self,
+               !contact ? "no contact" : s->contact.self ? "contact.self" : "contact.self is false", NULL, flags, sizeof flags);
+    print_part("friction", friction, !contact ? "no contact" : friction ? "mu > 0" : "mu is 0 everywhere", "FRICTION",
+               flags, sizeof flags);
+    print_part("subspace", (all & BASIS) != 0, all & BASIS ? "a body has a basis" : full, NULL, flags, sizeof flags);
+    print_part("bases that solve for modes", (all & SOLVED_BASIS) != 0,
+               all & SOLVED_BASIS ? "skinning, biharmonic, eigen or pod"
+               : all & BASIS      ? "all are affine or quadratic"
+                                  : full,
+               "EIGEN", flags, sizeof flags);
+    print_part("materials but Neo-Hookean", (all & OTHER_MATERIAL) != 0,
+               all & OTHER_MATERIAL ? "material.kind" : "all are neo_hookean", "MATERIALS", flags, sizeof flags);
+    print_part("materials by cell", (all & BY_CELL) != 0, all & BY_CELL ? "regions" : "no regions", NULL, flags, sizeof flags);
+    print_part("damping", (all & DAMPED) != 0, all & DAMPED ? "material.damping > 0" : "material.damping is 0 everywhere",
+               "DAMPING", flags, sizeof flags);
+    print_part("membranes, hinges, springs", 0, "scenes have none", "THIN", flags, sizeof flags);
+    print_part("scripted nodes", (all & SCRIPTED) != 0, all & SCRIPTED ? "a motion or script" : "nothing has a motion",
+               NULL, flags, sizeof flags);
+    printf("this scene needs: cc -O3 -march=native -fopenmp%s scene.c -lmetis -lm (headers tss.h%s%s)\n", flags,
+           contact ? " tss_ipc.h" : "", all & BASIS ? " tss_subspace.h" : "");
+}
+
 static int command_check(run *r) {
     static const char *const words[] = {"note", "warning", "error"};
     tss_check_report c;
@@ -1436,6 +1509,7 @@ static int command_check(run *r) {
     printf("%s: %d bodies, %d nodes, %d steps of %g s: %d errors, %d warnings\n", r->o.scene,
            r->s.bodies, tss_world_nodes(r->w), r->s.world.steps, r->s.world.dt, c.errors,
            c.warnings);
+    print_parts(&r->s);
     return c.errors > 0;
 }
 
@@ -1484,12 +1558,6 @@ static void *save_motions(run *r) {
 
 static void load_motions(run *r, void *data) {
     (void)scene_state(&r->s, data, scene_state(&r->s, NULL, 0, 0), 0);
-}
-
-static int has_bases(const scene *s) {
-    for (int k = 0; k < s->bodies; k++)
-        if (s->body[k].bases > 0) return 1;
-    return 0;
 }
 
 // The adaptive world last: it leaves the numbers of the bases in the scene.

@@ -61,6 +61,7 @@ variant() {
 }
 
 core_tests="test_core test_linalg test_ipcworld"
+features="MATERIALS DAMPING THIN FRICTION EIGEN"
 
 unit() {
     for exe in "$build"/test_*; do
@@ -81,6 +82,35 @@ nodeps() {
     variant no_metis "-fopenmp -DTSS_NO_METIS" test_linalg
     # shellcheck disable=SC2086
     variant nothing "$none" $core_tests
+    # Each feature alone, then all: what is left out is refused by name, what is left works.
+    every=""
+    for f in 2D 3D $features; do variant "no_$(echo "$f" | tr A-Z a-z)" "$none -DTSS_NO_$f" test_leave_out; done
+    for f in $features; do every="$every -DTSS_NO_$f"; done
+    variant no_2d_nothing "$none -DTSS_NO_2D$every" test_leave_out
+    variant no_3d_nothing "$none -DTSS_NO_3D$every" test_leave_out
+    scene_alone "$build/slope.json" 3
+    scene_alone examples/scenes/flat.json 3
+}
+
+# scene_alone SCENE STEPS: the flags that `tss check` prints for a scene build a runner that ends in
+# the same state, and that refuses a scene with a feature left out. slope.json: without friction.
+scene_alone() {
+    name=$(basename "$1" .json)
+    [ -f "$1" ] || sed 's/"mu": *[0-9.]*/"mu": 0/g' "examples/scenes/$name.json" >"$1"
+    make -s "$build/tss" || { bad "scene $name alone: the runner does not build"; return; }
+    defs=$("$build/tss" check "$1" 2>/dev/null | sed -n 's/^this scene needs: //p' | grep -o -- '-DTSS_NO_[A-Z0-9_]*' | tr '\n' ' ')
+    [ -n "$defs" ] || { bad "scene $name alone: no flags"; return; }
+    make -s BUILD="$build/alone_$name" CFLAGS="-O1 -march=native" DEFS="$defs" "$build/alone_$name/tss" \
+        >"$log/alone_$name.build" 2>&1 && [ ! -s "$log/alone_$name.build" ] ||
+        { bad "scene $name alone does not build without a warning" "$log/alone_$name.build"; return; }
+    for b in "$build" "$build/alone_$name"; do
+        "$b/tss" run "$1" --steps "$2" -o "$build/scene_out" 2>/dev/null | grep '^state ' >"$b/state_$name"
+    done
+    if [ -s "$build/state_$name" ] && cmp -s "$build/state_$name" "$build/alone_$name/state_$name"
+    then ok "scene $name alone: the same state with $defs"; else bad "scene $name alone: another state"; fi
+    if "$build/alone_$name/tss" run "$1" --set bodies.0.material.kind=stvk --steps 1 -o "$build/scene_out" \
+        >"$log/refused_$name.log" 2>&1 || ! grep -q "left out of this build by TSS_NO_MATERIALS" "$log/refused_$name.log"
+    then bad "scene $name alone: stvk is not refused" "$log/refused_$name.log"; else ok "scene $name alone refuses stvk"; fi
 }
 
 # What someone does who copies the headers into an empty folder.
