@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs the tests and ends with `N passed, N failed`.
 #   tests/run.sh BUILD             everything
-#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|unit   one part
+#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|stability|unit   one part
 # Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
 set -u
 export OMP_WAIT_POLICY=passive  # tests may share the machine: threads that wait shall not spin
@@ -159,18 +159,23 @@ scenes() {
     done
 }
 
-# Paper A's figures on small meshes: a line `ok` or `FAILED` a claim.
-figures() {
-    out="$log/figures.log"
-    sh tests/figures.sh "$build" >"$out" 2>&1
+# claims NAME: tests/NAME.sh prints a line `ok` or `FAILED` a claim.
+claims() {
+    out="$log/$1.log"
+    sh "tests/$1.sh" "$build" >"$out" 2>&1
     grep -E '^(ok|FAILED) ' "$out"
     p=$(grep -c '^ok ' "$out"); f=$(grep -c '^FAILED ' "$out")
     [ "$((p + f))" -gt 0 ] || { f=1; tail -n 15 "$out"; }
     passed=$((passed + p)); failed=$((failed + f))
 }
 
+# Paper A's figures on small meshes.
+figures() { claims figures; }
+# Stiff and extreme cases, judged on every iterate.
+stability() { claims stability; }
+
 case $part in
-all) unit; checkers; scenes; figures; nodeps; compat; sanitize ;;
+all) unit; checkers; scenes; figures; stability; nodeps; compat; sanitize ;;
 *) $part ;;
 esac
 printf '%d passed, %d failed\n' "$passed" "$failed"
