@@ -162,7 +162,7 @@ static void ridge(void) {
 
 // Fig. 16: a rubber hand on a bed of spikes.
 static const char hand[] =
-    "{\"world\": {\"steps\": 24}, \"contact\": {\"mu\": 0.2}, \"bodies\": ["
+    "{\"world\": {\"steps\": 14}, \"contact\": {\"mu\": 0.2}, \"bodies\": ["
     "{\"name\": \"hand\", \"shape\": {\"kind\": \"hand\", \"cells\": 16}, \"rotate\": [90, 0, 0],"
     " \"translate\": [0, 0.37, 0], \"velocity\": [0, -1, 0],"
     " \"material\": {\"E\": 1e6, \"nu\": 0.45, \"rho\": 1000}, " SKIN "},"
@@ -275,7 +275,7 @@ struct run {
     unsigned char *kinematic;
     double *halfspaces, *start;
     double checking;  // s
-    int *newton, steps, linear, finite, bad;
+    int *newton, steps, linear, finite, bad, untrue;  // untrue: converged above the tolerance
     tss_status worst;
     tss_step_info info;
     double distance, seconds, energy[2], momentum[2][6], mass;
@@ -379,7 +379,7 @@ static const test tests[] = {
     {"nu_0.49", block, "bodies.0.material.nu=0.49", 0, 0, NULL, NULL},
     {"nu_0.499", block, "bodies.0.material.nu=0.499", 0, 0, NULL, NULL},
     {"nu_0.4999", block, "bodies.0.material.nu=0.4999", 20, 0, NULL, NULL},
-    {"nu_-0.9", block, "bodies.0.material.nu=-0.9", 0, 0, NULL, NULL},
+    {"nu_-0.9", block, "bodies.0.material.nu=-0.9", 3, 0, NULL, NULL},
     {"h_1e-5", block, "world.dt=1e-5; bodies.0.translate=[0, -0.0096, 0]; world.steps=100", 80, 0, NULL, NULL},
     {"h_1e-4", block, "world.dt=1e-4; bodies.0.translate=[0, -0.0096, 0]; world.steps=100", 0, 0, NULL, NULL},
     {"h_1e-3", block, "world.dt=1e-3; bodies.0.translate=[0, -0.0096, 0]; world.steps=60", 0, 0, NULL, NULL},
@@ -587,6 +587,10 @@ static void advance(run *r) {
     if (r->info.linear_iterations > r->linear) r->linear = r->info.linear_iterations;
     r->distance = fmin(r->distance, r->info.min_distance);
     r->finite &= all_finite(r->w);
+    // What "converged" says: the last direction, and what scripted nodes lack, are below the tolerance.
+    double tol = r->s.solver.tol_rel * tss_world_diagonal(r->w);
+    if (r->info.status == TSS_STEP_CONVERGED)
+        r->untrue += !(r->info.decrement <= tol * (1 + 1e-9) && r->info.target_left <= tol * r->s.world.dt);
 }
 
 static int ascending(const void *a, const void *b) { return *(const int *)a - *(const int *)b; }
@@ -612,6 +616,7 @@ static void take_steps(run *r, int steps, const char **why) {
     qsort(r->newton, (size_t)r->steps, sizeof(int), ascending);
     if (!r->verdict.ok) *why = "the path is not sound";
     if (!r->finite) *why = "a number is not finite";
+    if (r->untrue) *why = "a step says converged above its tolerance";
 }
 
 static void print_optional(FILE *f, int defined, double value) {
