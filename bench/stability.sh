@@ -1,7 +1,7 @@
 #!/bin/sh
 # Stiff and extreme cases in every mode (docs/stability.md). Rows that are there are not run again.
 #   bench/stability.sh                     everything, into bench/results/
-#   bench/stability.sh NAME...             these cases (or those that begin so), `stiffness`, `rigid`
+#   bench/stability.sh NAME...             these cases (or those that begin so), `stiffness`, `fine_stiffness`, `rigid`
 #   OUT=folder bench/stability.sh ...      elsewhere
 set -eu
 export OMP_WAIT_POLICY=passive
