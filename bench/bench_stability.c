@@ -235,16 +235,18 @@ static const char sliver_drop[] =
     "{\"world\": {\"steps\": 30}, \"contact\": {\"mu\": 0.3}, \"bodies\": [{\"name\": \"block\","
     " \"mesh\": \"slivers.mesh\", \"translate\": [0, 0.01, 0], \"velocity\": [0, -1, 0], " MATERIAL ", " SKIN "}], " GROUND "}";
 
-// count blocks of 10 cm, one above the other, each exactly over the one below.
+// count blocks of 10 cm, one above the other, each exactly over the one below. E = 1e9 Pa: a column of
+// width w buckles under its own weight at a height of (7.84 E w^2 / (12 rho g))^(1/3), 0.9 m at 1e6 Pa
+// 8.7 m at 1e9 Pa. The gaps are just wider than d-hat: narrower ones are loaded springs.
 static char *stack(int count) {
     char *text = (char *)need(TEXT, 1);
-    size_t at = (size_t)snprintf(text, TEXT, "{\"world\": {\"steps\": 1000}, \"contact\": {\"mu\": 0.5}, \"bodies\": [");
+    size_t at = (size_t)snprintf(text, TEXT, "{\"world\": {\"steps\": 1000}, \"contact\": {\"mu\": 0.5, \"dhat\": 2e-4}, \"bodies\": [");
     for (int k = 0; k < count && at < TEXT; k++)
         at += (size_t)snprintf(text + at, TEXT - at,
                                "%s{\"name\": \"block %d\", \"shape\": {\"kind\": \"box\", \"lower\": [-0.05, 0, -0.05],"
                                " \"upper\": [0.05, 0.1, 0.05], \"cells\": [2, 2, 2]}, \"translate\": [0, %.17g, 0],"
-                               " \"material\": {\"E\": 1e6, \"nu\": 0.4, \"rho\": 1000}, " AFFINE "}",
-                               k ? ", " : "", k, 0.0005 + 0.1005 * k);
+                               " \"material\": {\"E\": 1e9, \"nu\": 0.4, \"rho\": 1000}, " AFFINE "}",
+                               k ? ", " : "", k, 2.1e-4 + 0.10021 * k);
     if (at >= TEXT || (size_t)snprintf(text + at, TEXT - at, "], " GROUND "}") >= TEXT - at)
         die("stack", "text too long");
     return text;
