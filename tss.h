@@ -284,7 +284,9 @@ TSS_API tss_energy_def tss_energy_def_default(void);
 // ---------------------------------------------------------------------------------------------
 
 typedef enum tss_material_kind {
-    // mu/2 (‖F‖² − d) − mu ln J + lambda/2 ln² J. Infinite at J → 0: elements never invert.
+    // mu/2 (‖F‖² − d) − mu ln J + lambda/2 ln² J. Infinite at J → 0: elements never invert. With nu < 0
+    // (lambda < 0) psi falls again below J = exp(mu/lambda): squashed that far, elements collapse
+    // towards J = 0 and steps stall; they still do not invert.
     TSS_NEO_HOOKEAN = 0,
     // Smith, De Goes, Kim 2018: m/2 (I_C − 3) + l/2 (J − 1 − 3m/4l)² − m/2 ln(I_C + 1), less its
     // value at rest; I_C = ‖F‖² (+ 1 in 2D), m = 4/3 mu, l = lambda + 5/6 mu make it agree with

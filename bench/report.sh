@@ -34,7 +34,7 @@ part() {
         return
     fi
     echo "report: $name, at most $seconds s"
-    limit "$seconds" sh "$script" "$@"
+    limit "$seconds" env BUILD="$build" OUT="$out" sh "$script" "$@"
     case $? in
     0) : >"$stamp" ;;
     124) fail "$name: stopped after $seconds s; the next \`make report\` goes on from here" ;;
@@ -44,9 +44,9 @@ part() {
 
 for p in $parts; do
     case $p in
-    error) part error 900 small "$out" ;;
-    stability) part stability 540 "$out" ;;
-    leave_out) part leave_out 300 "$out" ;;
+    error) part error 540 -b "$build" small "$out" ;;
+    stability) part stability 900 ;;
+    leave_out) part leave_out 300 "$build" "$out" ;;
     pages) "$build/report" bench/results "$out" || fail "pages: see above" ;;
     *) fail "$p: no such part (error stability leave_out pages)" ;;
     esac

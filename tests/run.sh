@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs the tests and ends with `N passed, N failed`.
 #   tests/run.sh BUILD             everything
-#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|unit   one part
+#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|sweep|stability|stability|unit   one part
 # Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
 set -u
 export OMP_WAIT_POLICY=passive  # tests may share the machine: threads that wait shall not spin
@@ -189,9 +189,7 @@ scenes() {
     done
 }
 
-# Paper A's figures on small meshes: a line `ok` or `FAILED` a claim. And the sweep of tolerances.
-figures() { claims figures; claims sweep; }
-
+# claims NAME: tests/NAME.sh prints a line `ok` or `FAILED` a claim.
 claims() {
     out="$log/$1.log"
     sh "tests/$1.sh" "$build" >"$out" 2>&1
@@ -201,8 +199,15 @@ claims() {
     passed=$((passed + p)); failed=$((failed + f))
 }
 
+# Paper A's figures on small meshes.
+figures() { claims figures; }
+# Error against run time.
+sweep() { claims sweep; }
+# Stiff and extreme cases, judged on every iterate.
+stability() { claims stability; }
+
 case $part in
-all) unit; checkers; scenes; figures; nodeps; compat; sanitize ;;
+all) unit; checkers; scenes; figures; sweep; stability; nodeps; compat; sanitize ;;
 *) $part ;;
 esac
 printf '%d passed, %d failed\n' "$passed" "$failed"
