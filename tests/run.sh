@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs the tests and ends with `N passed, N failed`.
 #   tests/run.sh BUILD             everything
-#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|sweep|stability|stability|unit   one part
+#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|sweep|stability|unit   one part
 # Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
 set -u
 export OMP_WAIT_POLICY=passive  # tests may share the machine: threads that wait shall not spin
