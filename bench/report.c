@@ -292,7 +292,7 @@ static void draw_stability(source *s, report *r) {
         "finite",      "energy drift", "momentum drift", "seconds"};
     char path[700];
     curves_table t;
-    if (!open_table(s, r, "stability.csv", stability_header, "sh bench/stability.sh out/report", &t,
+    if (!open_table(s, r, "stability.csv", stability_header, "OUT=out/report sh bench/stability.sh", &t,
                     path))
         return;
     stability_tiles(r, &t);
@@ -418,7 +418,7 @@ static void draw_stiffness(source *s, report *r) {
     char path[700];
     curves_table t;
     report_heading(r, "Stiffness: a hand on spikes, E from 100 Pa to 1 TPa");
-    if (!open_table(s, r, "stiffness.csv", stiffness_header, "sh bench/stability.sh out/report", &t,
+    if (!open_table(s, r, "stiffness.csv", stiffness_header, "OUT=out/report sh bench/stability.sh", &t,
                     path))
         return;
     stiffness_verdict(r, &t);
@@ -481,7 +481,7 @@ static void page_leave_out(source *s, report *r) {
     curves_table t;
     int over = 0, measured = 0;
     double worst = 0;
-    if (!open_table(s, r, "leave_out.csv", leave_out_header, "sh bench/leave_out.sh out/report", &t,
+    if (!open_table(s, r, "leave_out.csv", leave_out_header, "sh bench/leave_out.sh build out/report", &t,
                     path))
         return;
     for (int i = 0; i < t.rows; i++) {
