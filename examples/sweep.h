@@ -11,8 +11,9 @@
    The reference is full space at a ten-thousandth of the scene's tol. Its way is taken once; each step of
    each solver starts from it, and
        error = max ‖x − x_ref‖ / max ‖x_ref − x_t‖,    over the nodes that are free to move,
-   so that no solver pays for, or hides behind, what it did before. Seconds are the sum over the
-   steps; with --repeat K each step is taken K times, all solvers in turn, and the shortest counts. Then
+   so that no solver pays for, or hides behind, what it did before. Seconds are the sum over the steps;
+   with --repeat K all steps are taken K times, the solvers in turn at each, and a step's shortest
+   time counts. Then
    each solver goes its own way for --free-steps; error_final is how far its farthest node is from
    the reference's, over the diagonal.
 
@@ -27,11 +28,11 @@ typedef struct sweep_entry {
     int linear, mode;                      // TSS_LINEAR_*, TSS_MODE_*
     double error_nodes, error_modes, tol;  // negative: empty
     tss_world *w;
-    void *kept;  // checkpoint before the step
+    void *kept;  // checkpoint from before the first step
     size_t kept_bytes;
     tss_step_info info;
-    double step_seconds, step_error, step_mean;
-    double step_phase[TSS_PHASE_COUNT];
+    double step_error, step_mean;
+    double *best, *phase;  // seconds of each step: the shortest of the passes; × TSS_PHASE_COUNT
     // Over the steps:
     double seconds, error_max, error_sum, error_final, residual, enriched, modes;
     int failed;
@@ -174,27 +175,32 @@ static double sweep_distance(const tss_world *w, const double *x, const double *
     return sqrt(most);
 }
 
-// One step of all solvers from the reference's state, which then goes on.
-static int sweep_times(run *r, sweep *s, int step) {
-    for (int k = 0; k < s->entries; k++) {
-        sweep_entry *e = &s->e[k];
+// One step of all solvers from the reference's state, which then goes on. k: of the steps, from 0.
+static int sweep_step(run *r, sweep *s, int k) {
+    size_t wide = (size_t)tss_world_nodes(s->ref.w) * (size_t)tss_world_dim(s->ref.w);
+    memcpy(s->x_t, tss_world_positions(s->ref.w), wide * sizeof(double));
+    free(s->motions), s->motions = save_motions(r);
+    for (int q = 0; q < s->entries; q++) {
+        sweep_entry *e = &s->e[q];
         tss_result c = tss_world_copy_state(e->w, s->ref.w);
         if (c != TSS_OK) return fail(r, "%s: %s", r->o.scene, tss_result_text(c));
-        e->step_seconds = INFINITY;
-        if (r->o.repeat > 1) e->kept = save_world(e->w, &e->kept_bytes);
+        load_motions(r, s->motions);
+        if (!step_world(r, e->w, r->o.from + k + 1, &e->info)) return 0;
+        if (e->info.seconds >= e->best[k]) continue;
+        e->best[k] = e->info.seconds;
+        memcpy(e->phase + k * TSS_PHASE_COUNT, e->info.phase_seconds, sizeof e->info.phase_seconds);
     }
-    for (int i = 0; i < r->o.repeat; i++)
-        for (int k = 0; k < s->entries; k++) {
-            sweep_entry *e = &s->e[k];
-            if (i > 0 && !load_world(r, e->w, e->kept, e->kept_bytes)) return 0;
-            load_motions(r, s->motions);
-            if (!step_world(r, e->w, step, &e->info)) return 0;
-            if (e->info.seconds >= e->step_seconds) continue;
-            e->step_seconds = e->info.seconds;
-            memcpy(e->step_phase, e->info.phase_seconds, sizeof e->step_phase);
-        }
     load_motions(r, s->motions);
-    return step_world(r, s->ref.w, step, &s->ref.info);
+    return step_world(r, s->ref.w, r->o.from + k + 1, &s->ref.info);
+}
+
+// All worlds back to where the steps begin: what the solvers activated is forgotten.
+static int sweep_rewind(run *r, sweep *s, const void *start, size_t size, void *motions) {
+    int ok = load_world(r, s->ref.w, start, size);
+    for (int k = 0; ok && k < s->entries; k++)
+        ok = load_world(r, s->e[k].w, s->e[k].kept, s->e[k].kept_bytes);
+    load_motions(r, motions);
+    return ok;
 }
 
 static void sweep_number(FILE *f, double v) {
@@ -210,18 +216,18 @@ static void sweep_key(const run *r, const sweep_entry *e, FILE *f) {
 
 static double sweep_share(int part, int all) { return all > 0 ? (double)part / all : 0; }
 
-static void sweep_row(const run *r, const sweep *s, const sweep_entry *e, int step) {
+static void sweep_row(const run *r, const sweep *s, const sweep_entry *e, int k) {
     static const tss_phase phases[] = {TSS_PHASE_ENERGY,    TSS_PHASE_GRADIENT, TSS_PHASE_HESSIAN,
                                        TSS_PHASE_ORACLE,    TSS_PHASE_ASSEMBLE, TSS_PHASE_LINEAR,
                                        TSS_PHASE_COLLISION, TSS_PHASE_OTHER};
     const tss_step_info *i = &e->info;
     sweep_key(r, e, s->rows);
-    fprintf(s->rows, "%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%d,%d,%d,%s", step, e->step_seconds,
+    fprintf(s->rows, "%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%d,%d,%d,%s", r->o.from + k + 1, e->best[k],
             e->step_error, e->step_mean, i->residual_max, i->residual_mean, i->oracle_error,
             sweep_share(i->enriched_nodes, i->nodes), sweep_share(i->active_modes, i->modes), i->newton,
             i->linear_iterations, i->contacts, tss_status_text(i->status));
-    for (size_t k = 0; k < sizeof phases / sizeof *phases; k++)
-        fprintf(s->rows, ",%.6g", e->step_phase[phases[k]]);
+    for (size_t q = 0; q < sizeof phases / sizeof *phases; q++)
+        fprintf(s->rows, ",%.6g", e->phase[k * TSS_PHASE_COUNT + (int)phases[q]]);
     fputc('\n', s->rows);
 }
 
@@ -249,36 +255,24 @@ static void sweep_remember(sweep *s, int step, double way) {
     for (int i = 0; i < n; i++) s->shown_enriched[i] = sub.enriched && sub.enriched[i];
 }
 
-static void sweep_judge(run *r, sweep *s, int step) {
+static void sweep_judge(run *r, sweep *s, int q) {
     double mean, way = sweep_distance(s->ref.w, tss_world_positions(s->ref.w), s->x_t, &mean);
     for (int k = 0; k < s->entries; k++) {
         sweep_entry *e = &s->e[k];
         double off = sweep_distance(e->w, tss_world_positions(e->w), tss_world_positions(s->ref.w), &mean);
         e->step_error = off > 0 ? off / way : 0, e->step_mean = mean > 0 ? mean / way : 0;
-        e->seconds += e->step_seconds;
+        e->seconds += e->best[q];
         e->error_max = fmax(e->error_max, e->step_error), e->error_sum += e->step_error;
         e->residual = fmax(e->residual, e->info.residual_max);
         e->enriched += sweep_share(e->info.enriched_nodes, e->info.nodes);
         e->modes += sweep_share(e->info.active_modes, e->info.modes);
         e->failed += e->info.status != TSS_STEP_CONVERGED;
         s->failed += e->info.status != TSS_STEP_CONVERGED;
-        sweep_row(r, s, e, step);
+        sweep_row(r, s, e, q);
     }
     fflush(s->rows);
     s->failed += s->ref.info.status != TSS_STEP_CONVERGED;
-    sweep_remember(s, step, way);
-}
-
-static int sweep_step(run *r, sweep *s, int step) {
-    size_t wide = (size_t)tss_world_nodes(s->ref.w) * (size_t)tss_world_dim(s->ref.w);
-    memcpy(s->x_t, tss_world_positions(s->ref.w), wide * sizeof(double));
-    s->motions = save_motions(r);
-    int ok = sweep_times(r, s, step);
-    for (int k = 0; k < s->entries; k++) free(s->e[k].kept), s->e[k].kept = NULL;
-    free(s->motions);
-    s->motions = NULL;
-    if (ok) sweep_judge(r, s, step);
-    return ok;
+    sweep_remember(s, r->o.from + q + 1, way);
 }
 
 // Where the reference is after the free steps.
@@ -320,6 +314,13 @@ static int sweep_open(run *r, sweep *s) {
         s->shown_off[q] = (double *)need(n, sizeof(double));
     }
     s->shown_enriched = (double *)need(n, sizeof(double));
+    for (int k = 0; k < s->entries; k++) {
+        sweep_entry *e = &s->e[k];
+        e->kept = save_world(e->w, &e->kept_bytes);
+        e->best = (double *)need((size_t)s->steps, sizeof(double));
+        e->phase = (double *)need((size_t)s->steps * TSS_PHASE_COUNT, sizeof(double));
+        for (int q = 0; q < s->steps; q++) e->best[q] = INFINITY;
+    }
     snprintf(path, sizeof path, "%s/error_steps.csv", r->o.out);
     s->rows = fopen(path, "w");
     if (!s->rows) return fail(r, "%s: cannot be written: %s", path, strerror(errno));
@@ -441,9 +442,14 @@ static int sweep_run(run *r, sweep *s) {
     void *start = save_world(s->ref.w, &size), *motions = save_motions(r);
     int ok = 1;
     started = now(NULL);
-    for (int k = 1; ok && k <= s->steps; k++) {
-        ok = sweep_step(r, s, r->o.from + k);
-        fprintf(stderr, "sweep: step %d of %d, %.0f s\n", k, s->steps, now(NULL) - started);
+    for (int pass = 1; ok && pass <= r->o.repeat; pass++) {
+        ok = sweep_rewind(r, s, start, size, motions);
+        for (int k = 0; ok && k < s->steps; k++) {
+            ok = sweep_step(r, s, k);
+            if (ok && pass == r->o.repeat) sweep_judge(r, s, k);
+            fprintf(stderr, "sweep: pass %d of %d, step %d of %d, %.0f s\n", pass, r->o.repeat, k + 1, s->steps,
+                    now(NULL) - started);
+        }
     }
     double *end = (double *)need((size_t)tss_world_nodes(s->ref.w) * (size_t)tss_world_dim(s->ref.w), sizeof *end);
     ok = ok && sweep_goal(r, s, start, size, motions, end) && sweep_free(r, s, motions, end);
@@ -454,7 +460,7 @@ static int sweep_run(run *r, sweep *s) {
 static int command_sweep(run *r) {
     static sweep s;
     int ok = read_scene(r) && sweep_run(r, &s);
-    for (int k = 0; k < s.entries; k++) tss_world_destroy(s.e[k].w), free(s.e[k].kept);
+    for (int k = 0; k < s.entries; k++) tss_world_destroy(s.e[k].w), free(s.e[k].kept), free(s.e[k].best), free(s.e[k].phase);
     tss_world_destroy(s.ref.w);
     if (s.rows) fclose(s.rows);
     free(s.x_t), free(s.motions), free(s.shown_enriched);
