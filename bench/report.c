@@ -1,6 +1,7 @@
 /* report.c: the pages of `make report`
 
    report [-o OUT] RESULTS_DIR OUT_DIR
+   report --text RESULTS_DIR            // the table of docs/error.md
 
    Writes OUT/index.html (error against run time), OUT/stability.html and OUT/leave_out.html; OUT is
    OUT_DIR unless given. RESULTS_DIR holds the committed large measurements (bench/results), OUT_DIR
@@ -541,10 +542,44 @@ static int write_pages(const char *results, const char *out, const char *to) {
     return !s.failed;
 }
 
+// A line a scene for the documentation: the stretch of errors in which adaptive is the cheapest,
+// and its cheapest run of at most 10, 3 and 1 % against full space at the scene's tolerance.
+static int print_text(const char *results) {
+    static const double levels[] = {0.1, 0.03, 0.01};
+    char rows[600], steps[600];
+    curves c;
+    curves_error why;
+    snprintf(rows, sizeof rows, "%s/error_vs_time.csv", results);
+    snprintf(steps, sizeof steps, "%s/error_steps.csv", results);
+    if (!curves_read(&c, rows, steps, &why)) return fprintf(stderr, "report: %s\n", why.message), 0;
+    printf("| scene | cheapest for errors of | decades | rank |");
+    for (int k = 0; k < 3; k++) printf(" %g %%: error_nodes, direct, best |", 100 * levels[k]);
+    printf("\n|---|---|---|---|---|---|---|\n");
+    for (int i = 0; i < c.scenes; i++) {
+        curves_verdict v = curves_dominates(&c, i, CURVES_MAX);
+        if (v.both.decades > 0)
+            printf("| %s | %.2g to %.2g %% | %.1f |", c.scene[i], 100 * v.both.lo, 100 * v.both.hi, v.both.decades);
+        else
+            printf("| %s | none | 0 |", c.scene[i]);
+        printf(" %.2f |", curves_rank_of(&c, i, 0).step[0]);
+        for (int k = 0; k < 3; k++) {
+            curves_choice h = curves_recommend(&c, i, CURVES_MAX, levels[k]).kind[CURVES_ADAPTIVE_KIND];
+            if (h.row < 0)
+                printf(" - |");
+            else
+                printf(" %g, %.2f, %.2f |", c.row[h.row].error_nodes, h.over_direct, h.over_full);
+        }
+        printf("\n");
+    }
+    curves_free(&c);
+    return 1;
+}
+
 #ifndef REPORT_NO_MAIN
 int main(int argc, char **argv) {
     const char *to = NULL, *folder[2] = {NULL, NULL};
     int n = 0;
+    if (argc == 3 && !strcmp(argv[1], "--text")) return print_text(argv[2]) ? 0 : 1;
     for (int i = 1; i < argc; i++)
         if (!strcmp(argv[i], "-o") && i + 1 < argc)
             to = argv[++i];
@@ -553,7 +588,7 @@ int main(int argc, char **argv) {
         else
             n = 3, i = argc;
     if (n != 2) {
-        fprintf(stderr, "usage: report [-o OUT] RESULTS_DIR OUT_DIR\n");
+        fprintf(stderr, "usage: report [-o OUT] RESULTS_DIR OUT_DIR\n       report --text RESULTS_DIR\n");
         return 2;
     }
     if (!to) to = folder[1];
