@@ -4,8 +4,8 @@
  *
  * What it is: a decoder f(z), a small network, maps r numbers to the positions of a mesh. It is
  * trained so that what it can reach is what the body does (Eq. 3 or 4), and so that the elastic
- * energy P(f(z)) has a Hessian that changes slowly with z (Eq. 9, 10): Newton-like solvers then need
- * fewer iterations. Everything runs in C, in double precision, without automatic differentiation:
+ * energy P(f(z)) has a Hessian that changes slowly with z (Eq. 9, 10): solvers then need fewer
+ * iterations. Everything runs in C, in double precision, without automatic differentiation:
  * derivatives are jets (below), third derivatives of the energy included.
  *
  *     #define TSS_IMPLEMENTATION            // in one .c or .cpp file
@@ -14,7 +14,8 @@
  *
  *     int width[4] = {8, 64, 64, free_coordinates};
  *     tss_net_def nd = tss_net_def_default();
- *     nd.layers = 3, nd.width = width, nd.outputs = coordinates, nd.out_base = X, nd.out_index = free;
+ *     nd.layers = 3, nd.width = width, nd.outputs = coordinates;
+ *     nd.out_base = X, nd.out_index = free;
  *     tss_model m = {0};
  *     tss_net_create(NULL, &nd, &m.decoder);
  *     tss_training_def td = tss_training_def_default();   // unsupervised: Eq. 4, then Eq. 10
@@ -24,8 +25,9 @@
  *     for (int k = 0; k < 100000; k++) tss_training_step(t, NULL);
  *     tss_model_write(NULL, &m, "bar.tssn");
  *
- * Not here yet: the selection of cubature elements (Eq. 11; elements take a subset with weights of
- * yours), reduced solvers (Eq. 2).
+ * tss_cubature_select (Eq. 11) finds few cells that stand for all of them in training; tss_reduced
+ * (Eq. 2) simulates with a trained decoder. Not here yet: projected Newton, scripted handles and
+ * contact in tss_reduced.
  *
  * Jets: for directions D_a, a < k, and one symmetric matrix C (k × k) a pass carries
  *     y,   y_a = ∂_a y,   y_2 = Σ_ab C_ab ∂_a ∂_b y
@@ -42,7 +44,7 @@
  *
  * CONVENTIONS
  *     Batches are rows: batch × width, row-major. θ: for each layer W (inputs × outputs, row-major:
- *     W[i·outputs + o]), then b (outputs). y = activation(x W + b), the last layer without activation.
+ *     W[i·outputs + o]), then b (outputs). y = activation(x W + b), the last layer without σ.
  *     x: coordinates, node by node, as in tss.h. r: inputs of the decoder. Gradients are *added* to
  *     arrays named ..._bar, other outputs are overwritten. Symbols are paper B's: z, f, g, P, L_C,
  *     L_LS, λ, σ, M (a mass for each coordinate).
@@ -78,8 +80,8 @@ TSS_API double tss_rng_normal(tss_rng *r);   // N(0, 1), Box and Muller; two uni
 // ---------------------------------------------------------------------------------------------
 
 typedef enum tss_activation {
-    // s > 0: s, else e^s − 1. C1 only: the second derivative jumps from 1 to 0 at 0, and is taken to
-    // be 1 there (the left limit, as JAX does).
+    // s > 0: s, else e^s − 1. C1 only: the second derivative jumps from 1 to 0 at 0, where it is
+    // taken to be 1 (the left limit, as in JAX).
     TSS_ELU = 0,
     TSS_SILU,      // s / (1 + e^−s), smooth
     TSS_SOFTPLUS,  // ln(1 + e^s), smooth
@@ -89,16 +91,17 @@ typedef enum tss_activation {
 
 typedef struct tss_net_def {
     int layers;        // linear layers, 1..64
-    const int *width;  // layers + 1 numbers >= 1: inputs of the MLP, hidden widths, outputs of the MLP
+    const int *width;  // layers + 1 numbers >= 1: inputs of the MLP, hidden, outputs of the MLP
     tss_activation activation;  // between layers; default TSS_ELU
-    uint64_t seed;     // of θ: uniform in ±1/√inputs for W and b of a layer; default 0
-    // Encoder's first map: mlp(Aᵀ(x − x0)). in_matrix A: inputs × width[0], row-major; NULL (default):
-    // the input is the MLP's. in_base x0: inputs numbers, NULL: 0.
+    uint64_t seed;              // of θ: uniform in ±1/√inputs for W and b of a layer; default 0
+    // Encoder's first map: mlp(Aᵀ(x − x0)). in_matrix A: inputs × width[0], row-major; NULL
+    // (default): the input is the MLP's. in_base x0: inputs numbers, NULL: 0.
     int inputs;
     const double *in_base, *in_matrix;
-    // Decoder's last map: x0 + B·mlp with out_matrix B (outputs × width[layers], row-major); or, if it
-    // is NULL, x0 + s·mlp, output i of the MLP going to coordinate out_index[i] (distinct; NULL: i).
-    // out_base x0: outputs numbers, NULL: 0. outputs 0 (default): width[layers], out_index NULL.
+    // Decoder's last map: x0 + B·mlp with out_matrix B (outputs × width[layers], row-major); or, if
+    // it is NULL, x0 + s·mlp, output i of the MLP going to coordinate out_index[i] (distinct; NULL:
+    // i). out_base x0: outputs numbers, NULL: 0. outputs 0 (default): width[layers], out_index
+    // NULL.
     int outputs;
     const double *out_base, *out_matrix;
     const int *out_index;
@@ -135,37 +138,38 @@ TSS_API void tss_work_destroy(tss_work *work);  // NULL allowed
 // 2·batch·parameters flops, and the maps.
 TSS_API tss_result tss_net_forward(const tss_net *net, tss_work *work, int batch, const double *in,
                                    double *out);
-// The reverse pass (runs the forward pass first): with out_bar = ∂S/∂out, batch × outputs, adds ∂S/∂θ to
-// theta_bar and ∂S/∂in to in_bar (batch × inputs). Each of these may be NULL.
+// The reverse pass (runs the forward pass first): with out_bar = ∂S/∂out, batch × outputs, adds
+// ∂S/∂θ to theta_bar and ∂S/∂in to in_bar (batch × inputs). Each of these may be NULL.
 TSS_API tss_result tss_net_backward(const tss_net *net, tss_work *work, int batch, const double *in,
                                     const double *out_bar, double *theta_bar, double *in_bar);
-// Jets of a net without in_matrix: D batch × k × inputs; C batch × k × k, symmetric (NULL: x2 is not
-// asked for). Writes x (batch × outputs), x1 (batch × k × outputs), x2 (batch × outputs); NULL: not
-// wanted. k >= 0.
+// Jets of a net without in_matrix: D batch × k × inputs; C batch × k × k, symmetric (NULL: x2 is
+// not asked for). Writes x (batch × outputs), x1 (batch × k × outputs), x2 (batch × outputs); NULL:
+// not wanted. k >= 0.
 TSS_API tss_result tss_net_jets(const tss_net *net, tss_work *work, int batch, int k,
                                 const double *z, const double *D, const double *C, double *x,
                                 double *x1, double *x2);
 
 // ---------------------------------------------------------------------------------------------
 // >>neural_elements (public)
-// P(x) = Σ_e w_e vol_e Ψ(F_e) over tetrahedra or triangles of a plane (1 m deep, as in tss.h), Ψ the
-// stable Neo-Hookean density of Smith, De Goes and Kim 2018 without the logarithm:
+// P(x) = Σ_e w_e vol_e Ψ(F_e) over tetrahedra or triangles of a plane (1 m deep, as in tss.h), Ψ
+// the stable Neo-Hookean density of Smith, De Goes and Kim 2018 without the logarithm:
 //     Ψ = μ/2 ‖F‖² + λ'/2 (J − α)² − rest,  λ' = λ + μ,  α = 1 + μ/λ',
-// zero with no stress at rest, linear elasticity with μ and λ for small strain, finite when inverted.
-// A polynomial in F: third derivatives are short. tss_neural_density gives a tss.h material with it.
+// zero with no stress at rest, linear elasticity with μ and λ for small strain, finite when
+// inverted. A polynomial in F: third derivatives are short. tss_neural_density gives a tss.h
+// material with it.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_elements_def {
-    int dim;          // 3 (default): tetrahedra; 2: triangles
+    int dim;  // 3 (default): tetrahedra; 2: triangles
     int nodes;
     const double *X;  // rest positions, nodes × dim, m
     int cells;
-    const int *cell;  // cells × (dim + 1), positive volume
-    double E, nu;     // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
-    const double *mu, *lambda;  // Lamé parameters of each cell, Pa, in place of E and nu; both or NULL
-    int count;            // subset of cells (cubature, Eq. 11); used if subset is not NULL
-    const int *subset;    // count cells, each at most once
-    const double *weight; // w_e >= 0 of each cell of the subset, or of each cell; NULL: 1
+    const int *cell;            // cells × (dim + 1), positive volume
+    double E, nu;               // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
+    const double *mu, *lambda;  // of each cell, Pa, in place of E and nu; both or NULL
+    int count;                  // subset of cells (cubature, Eq. 11); used if subset is not NULL
+    const int *subset;          // count cells, each at most once
+    const double *weight;       // w_e >= 0 of each cell of the subset, or of each cell; NULL: 1
     int cookie;
 } tss_elements_def;
 TSS_API tss_elements_def tss_elements_def_default(void);
@@ -179,27 +183,29 @@ TSS_API void tss_elements_destroy(tss_elements *e);  // NULL allowed
 // P at x (nodes × dim); its gradient is added to g (nodes × dim, NULL: not wanted). Serial.
 TSS_API double tss_elements_potential(const tss_elements *e, const double *x, double *g);
 // Jets at x along x1 (k × nodes·dim) with C (k × k) and x2 (nodes·dim), both NULL: no second order.
-// Writes P, P1 (k) and P2; adds to the ..._bar arrays the gradient of alpha P + Σ beta_a P1_a + gamma P2
-// in x, x1 and x2. Any output may be NULL; beta NULL: 0. Serial. Errors: BAD_ARGUMENT, NO_MEMORY.
-TSS_API tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, const double *x1,
-                                     const double *C, const double *x2, double *P, double *P1,
-                                     double *P2, double alpha, const double *beta, double gamma,
-                                     double *x_bar, double *x1_bar, double *x2_bar);
+// Writes P, P1 (k) and P2; adds to the ..._bar arrays the gradient of alpha P + Σ beta_a P1_a +
+// gamma P2 in x, x1 and x2. Any output may be NULL; beta NULL: 0. Serial. Errors: BAD_ARGUMENT,
+// NO_MEMORY.
+TSS_API tss_result tss_elements_jets(const tss_elements *e, int k, const double *x,
+                                     const double *x1, const double *C, const double *x2, double *P,
+                                     double *P1, double *P2, double alpha, const double *beta,
+                                     double gamma, double *x_bar, double *x1_bar, double *x2_bar);
 // A tss_density; user: two doubles, mu and lambda. Set has_C = 1 in the material.
 TSS_API void tss_neural_density(void *user, int dim, int count, const int *cell, const double *F,
                                 double *psi, double *P, double *C);
 
 // ---------------------------------------------------------------------------------------------
 // >>reduced (public)
-// P(f(z)) and its derivatives in z. The decoder has no in_matrix and gives the elements' coordinates.
+// P(f(z)) and its derivatives in z. The decoder has no in_matrix and gives the elements'
+// coordinates.
 // ---------------------------------------------------------------------------------------------
 
 // For each of batch rows of z: P (batch), gradient (batch × r), hessian (batch × r × r, exact, the
 // curvature of f included, symmetric to rounding). NULL: not wanted. Cost: O(1) columns, with the
 // Hessian 2(r + 1). Errors: BAD_ARGUMENT, NO_MEMORY.
-TSS_API tss_result tss_reduced_potential(const tss_net *decoder, const tss_elements *e, tss_work *work,
-                                         int batch, const double *z, double *P, double *gradient,
-                                         double *hessian);
+TSS_API tss_result tss_reduced_potential(const tss_net *decoder, const tss_elements *e,
+                                         tss_work *work, int batch, const double *z, double *P,
+                                         double *gradient, double *hessian);
 // u ᵀ∇²_z P v of each row (z, u, v: batch × r), by polarisation of one jet.
 TSS_API tss_result tss_reduced_second(const tss_net *decoder, const tss_elements *e, tss_work *work,
                                       int batch, const double *z, const double *u, const double *v,
@@ -221,10 +227,11 @@ TSS_API tss_result tss_loss_reconstruction(const tss_net *decoder, const tss_net
 // Eq. (4): mean P(f(z_i)) + lambda · mean over i ≠ j of ¼ ln²((‖f_i − f_j‖²_M + eps) /
 // (sigma² ‖z_i − z_j‖² + eps)), which is ln²(‖Δf‖_M / (σ‖Δz‖)) for eps = 0. sigma > 0, eps >= 0,
 // batch >= 2. parts (NULL, or 2 numbers): the mean potential; the mean repulsion without lambda.
-TSS_API tss_result tss_loss_unsupervised(const tss_net *decoder, const tss_elements *e, tss_work *work,
-                                         const double *mass, double lambda, double sigma, double eps,
-                                         int batch, const double *z, double weight, double *loss,
-                                         double *parts, double *decoder_bar);
+TSS_API tss_result tss_loss_unsupervised(const tss_net *decoder, const tss_elements *e,
+                                         tss_work *work, const double *mass, double lambda,
+                                         double sigma, double eps, int batch, const double *z,
+                                         double weight, double *loss, double *parts,
+                                         double *decoder_bar);
 
 typedef enum tss_estimator {
     TSS_LIPSCHITZ_EXACT = 0,
@@ -241,17 +248,44 @@ typedef struct tss_lipschitz_def {
 } tss_lipschitz_def;
 TSS_API tss_lipschitz_def tss_lipschitz_def_default(void);
 
-// Eq. (9) and (12): mean over all i ≠ j of the batch of ‖∂ᵒP(z_i) − ∂ᵒP(z_j)‖² / ‖z_i − z_j‖², Frobenius
-// norm. probe: probes × 2 × r numbers u, v (v unused by U), shared by the batch; NULL for EXACT.
-// z_bar (batch × r): the gradient in z, for samples that come from an encoder.
+// Eq. (9) and (12): mean over all i ≠ j of the batch of ‖∂ᵒP(z_i) − ∂ᵒP(z_j)‖² / ‖z_i − z_j‖²,
+// Frobenius norm. probe: probes × 2 × r numbers u, v (v unused by U), shared by the batch; NULL for
+// EXACT. z_bar (batch × r): the gradient in z, for samples that come from an encoder.
 TSS_API tss_result tss_loss_lipschitz(const tss_net *decoder, const tss_elements *e, tss_work *work,
                                       const tss_lipschitz_def *def, int batch, const double *z,
                                       const double *probe, double weight, double *loss,
                                       double *decoder_bar, double *z_bar);
 // Eq. (7): the largest ratio over the pairs of the batch (pairs at distance 0 are left out), exact,
 // Frobenius norm. order 0, 1 or 2; batch >= 2.
-TSS_API tss_result tss_lipschitz_estimate(const tss_net *decoder, const tss_elements *e, tss_work *work,
-                                          int order, int batch, const double *z, double *out);
+TSS_API tss_result tss_lipschitz_estimate(const tss_net *decoder, const tss_elements *e,
+                                          tss_work *work, int order, int batch, const double *z,
+                                          double *out);
+
+// ---------------------------------------------------------------------------------------------
+// >>cubature (public)
+// Which cells, with which weights, stand for all of them (Eq. 11): Σ w_e g_e(z_t) ≈ Σ g_e(z_t), g_e
+// the reduced gradient of one cell. Greedy non-negative least squares (An, Kim, James 2008, with
+// Lawson and Hanson's active set): the cell that points most along what is missing is added, all
+// weights are solved for again, cells whose weight would be negative leave.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_cubature_def {
+    int count;       // most cells, >= 1; default 300
+    int candidates;  // cells to choose from, drawn by seed; 0 (default): all. Memory: candidates ×
+                     // samples × r doubles
+    double tol;      // relative error at which to stop, >= 0; default 0
+    uint64_t seed;
+} tss_cubature_def;
+TSS_API tss_cubature_def tss_cubature_def_default(void);
+// z: samples × r, of the initial subspace; each counts alike (its equations are divided by the norm
+// of its gradient). subset and weight: room for def.count; ascending cells of e and w_e > 0, ready
+// for tss_elements_def. *count: cells chosen; *error (NULL allowed): ‖Σ w_e g_e − g‖ / ‖g‖ over the
+// samples. Cost: chosen · candidates · samples · r, and as much as memory. Errors: BAD_ARGUMENT,
+// NO_MEMORY.
+TSS_API tss_result tss_cubature_select(const tss_net *decoder, const tss_elements *e,
+                                       tss_work *work, const tss_cubature_def *def, int samples,
+                                       const double *z, int *subset, double *weight, int *count,
+                                       double *error);
 
 // ---------------------------------------------------------------------------------------------
 // >>adam (public)
@@ -260,12 +294,12 @@ TSS_API tss_result tss_lipschitz_estimate(const tss_net *decoder, const tss_elem
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_adam_def {
-    double rate;          // > 0; default 1e-3
-    double beta1, beta2;  // in [0, 1); defaults 0.9, 0.999
-    double eps;           // > 0; default 1e-8
-    double decay;         // > 0; default 1
-    uint64_t decay_every; // steps; 0 (default): no decay
-    uint64_t warmup;      // steps; default 0
+    double rate;           // > 0; default 1e-3
+    double beta1, beta2;   // in [0, 1); defaults 0.9, 0.999
+    double eps;            // > 0; default 1e-8
+    double decay;          // > 0; default 1
+    uint64_t decay_every;  // steps; 0 (default): no decay
+    uint64_t warmup;       // steps; default 0
 } tss_adam_def;
 TSS_API tss_adam_def tss_adam_def_default(void);
 
@@ -276,7 +310,8 @@ TSS_API tss_result tss_adam_create(const tss_host *host, const tss_adam_def *def
 TSS_API void tss_adam_destroy(tss_adam *a);  // NULL allowed
 // Moves parameters [first, first + count) along their gradient with the rate of the current step;
 // tss_adam_advance then makes it the next. A network each: two calls, one advance.
-TSS_API void tss_adam_update(tss_adam *a, size_t first, size_t count, double *theta, const double *g);
+TSS_API void tss_adam_update(tss_adam *a, size_t first, size_t count, double *theta,
+                             const double *g);
 TSS_API void tss_adam_advance(tss_adam *a);
 TSS_API uint64_t tss_adam_steps(const tss_adam *a);
 TSS_API double tss_adam_rate(const tss_adam *a);  // of the current step
@@ -285,8 +320,9 @@ TSS_API tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restar
 
 // ---------------------------------------------------------------------------------------------
 // >>models (public)
-// What a file holds: a decoder, and what training needs to go on in the very bits of an uninterrupted
-// run. The format is documented in docs/neural.md: little-endian, magic, version, size, checksum.
+// What a file holds: a decoder, and what training needs to go on in the very bits of an
+// uninterrupted run. The format is documented in docs/neural.md: little-endian, magic, version,
+// size, checksum.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_model {  // start from zeros
@@ -298,14 +334,14 @@ typedef struct tss_model {  // start from zeros
 } tss_model;
 TSS_API void tss_model_free(tss_model *m);  // destroys the parts, leaves zeros
 
-// Bytes that the model takes; written to data if size suffices (data NULL: the size only; 0: size too
-// small, or no decoder).
+// Bytes that the model takes; written to data if size suffices (data NULL: the size only; 0: size
+// too small, or no decoder).
 TSS_API size_t tss_model_save(const tss_model *m, void *data, size_t size);
-// *out is overwritten; on an error zeros, and why (NULL allowed, why_size bytes) says what is wrong.
-// Nothing is believed: sizes are checked against the bytes there are before memory is taken.
+// *out is overwritten; on an error zeros, and why (NULL allowed, why_size bytes) says what is
+// wrong. Nothing is believed: sizes are checked against the bytes there are before memory is taken.
 // Errors: FORMAT, NO_MEMORY.
-TSS_API tss_result tss_model_load(const tss_host *host, const void *data, size_t size, tss_model *out,
-                                  char *why, size_t why_size);
+TSS_API tss_result tss_model_load(const tss_host *host, const void *data, size_t size,
+                                  tss_model *out, char *why, size_t why_size);
 // The same through files; also FILE. A file is written beside the old one first, then renamed.
 TSS_API tss_result tss_model_write(const tss_host *host, const tss_model *m, const char *path);
 TSS_API tss_result tss_model_read(const tss_host *host, const char *path, tss_model *out, char *why,
@@ -313,22 +349,23 @@ TSS_API tss_result tss_model_read(const tss_host *host, const char *path, tss_mo
 
 // ---------------------------------------------------------------------------------------------
 // >>training (public)
-// Eq. (10): L_C + λ_LS L_LS, from step lipschitz_from on. 0: joint training from the start; later: vanilla
-// first. With a given def the next step depends on the model alone (bits included): save between
-// any two steps, load, go on.
+// Eq. (10): L_C + λ_LS L_LS, from step lipschitz_from on. 0: joint training from the start; later:
+// vanilla first. With a given def the next step depends on the model alone (bits included): save
+// between any two steps, load, go on.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_training_def {
-    tss_model *model;  // borrowed; adam is made from the def below if it has none
-    const tss_elements *elements;  // P of Eq. (4); borrowed. NULL allowed when supervised without L_LS
+    tss_model *model;              // borrowed; adam is made from the def below if it has none
+    const tss_elements *elements;  // P of Eq. (4); borrowed. Supervised: NULL allowed
     const tss_elements *cubature;  // P of L_LS; NULL (default): elements
     const double *mass;            // of each coordinate, borrowed; NULL: 1
-    const double *frames;  // supervised (the model has an encoder): frame_count × coordinates, borrowed
+    const double *frames;  // supervised (there is an encoder): frame_count × coordinates, borrowed
     int frame_count;
     int batch;             // default 32
     double lambda, sigma;  // Eq. (4), unsupervised; defaults 1, 1
     double eps;            // of the logarithm; default 1e-8
-    uint64_t ramp;         // unsupervised: out_scale and sigma grow from 0 to 1 over so many steps; default 0
+    uint64_t ramp;  // unsupervised: steps over which out_scale grows from 0 to 1, and sigma from 0
+                    // to itself; default 0: none
     double lipschitz_weight;  // λ_LS; default 0: vanilla
     uint64_t lipschitz_from;  // first step with L_LS; default 0
     int lipschitz_batch;      // samples of L_LS, >= 2; default 16
@@ -344,7 +381,7 @@ typedef struct tss_training_info {
     double parts[2];   // unsupervised: potential, repulsion
     double lipschitz;  // L_LS of the batch (its estimate), 0 before it is on
     double rate;
-    int skipped;       // 1: the gradient was not finite, and θ stays as it was
+    int skipped;  // 1: the gradient was not finite, and θ stays as it was
 } tss_training_info;
 
 typedef struct tss_training tss_training;  // opaque: scratch; the state is the model's
@@ -354,6 +391,57 @@ TSS_API tss_result tss_training_create(const tss_host *host, const tss_training_
 TSS_API void tss_training_destroy(tss_training *t);  // NULL allowed; the model stays
 // One step of Adam; info may be NULL. Errors: NO_MEMORY.
 TSS_API tss_result tss_training_step(tss_training *t, tss_training_info *info);
+
+// ---------------------------------------------------------------------------------------------
+// >>reduced_solver (public)
+// Eq. (2) by L-BFGS with backtracking: each step finds z that minimises
+//     E(z) = ‖f(z) − q̄‖²_M / (2h²) + P(f(z)) − force·f(z),   q̄ = 2 x_t − x_{t−1},
+// or, when h = 0 (quasi-static), the same without the first term.
+// ---------------------------------------------------------------------------------------------
+
+typedef enum tss_exit {    // the paper's four (§5)
+    TSS_EXIT_CONVERGED,    // ‖∇E‖∞ <= eps
+    TSS_EXIT_SADDLE,       // E fell by less than ftol |E|
+    TSS_EXIT_LINE_SEARCH,  // max_line trials without enough decrease
+    TSS_EXIT_ITERATIONS,   // max_iterations
+    TSS_EXITS
+} tss_exit;
+
+typedef struct tss_reduced_def {
+    const tss_net *decoder;        // borrowed, as is the rest
+    const tss_elements *elements;  // all, or a cubature
+    const double *mass;            // of each coordinate, kg; required when h > 0
+    const double *start;           // r numbers; NULL: 0
+    double h;                      // s; 0: quasi-static. Default 0.05
+    double eps;                    // J per unit of z, >= 0; default 1e-5
+    double ftol;  // 0 <= ftol; default 2.2e-9 (L-BFGS-B's, which the paper's code uses); 0: never
+    int memory;   // pairs, 1..64; default 10
+    int max_line, max_iterations;  // defaults 128, 1024
+    int cookie;
+} tss_reduced_def;
+TSS_API tss_reduced_def tss_reduced_def_default(void);
+
+typedef struct tss_reduced_info {
+    tss_exit exit;
+    int iterations, evaluations;  // of E with its gradient
+    double energy, gradient;      // E and ‖∇E‖∞ at the end
+} tss_reduced_info;
+
+typedef struct tss_reduced tss_reduced;  // opaque
+// Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
+                                      tss_reduced **out);
+TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
+// One step; starts from z_t, or from 2 z_t − z_{t−1} where E is lower. Allocates nothing. info may
+// be NULL. Errors: none; how it ended is info.exit, and the state is the best that was found.
+TSS_API tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *info);
+TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);  // at rest in f(z)
+// Force on each coordinate, N, until changed; copied. NULL: none.
+TSS_API void tss_reduced_set_force(tss_reduced *s, const double *force);
+TSS_API const double *tss_reduced_z(const tss_reduced *s);  // r
+TSS_API const double *tss_reduced_x(const tss_reduced *s);  // coordinates, f(z)
+TSS_API const uint64_t *tss_reduced_exits(
+    const tss_reduced *s);  // TSS_EXITS counts since the start
 
 #ifdef __cplusplus
 }
@@ -474,8 +562,8 @@ static void tss__n_zero(double *p, size_t count) {
 // ---------------------------------------------------------------------------------------------
 // >>products (private)
 // C += A B by tiles of 4 × 8 sums held in registers; eight columns of B are copied into a panel
-// first, so that transposes and gathered rows or columns cost the same. Sums run over the inner index
-// in order: the bits do not depend on the size of the batch.
+// first, so that transposes and gathered rows or columns cost the same. Sums run over the inner
+// index in order: the bits do not depend on the size of the batch.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss__n_view {  // element (i, j): p[(ri ? ri[i] : i)·rs + (ci ? ci[j] : j)·cs]
@@ -581,7 +669,8 @@ static void tss__n_activate(tss_activation a, double s, double d[4]) {
 
 #define TSS__NET_COOKIE 0x6e6574
 #define TSS__NET_LAYERS 64
-#define TSS__N_CHUNKS 8  // pieces of a batch: the most threads that help, and gradients that are held
+#define TSS__N_CHUNKS \
+    8  // pieces of a batch: the most threads that help, and gradients that are held
 
 enum { TSS__MAP_NONE, TSS__MAP_SCATTER, TSS__MAP_MATRIX };
 
@@ -618,9 +707,11 @@ static const char *tss__net_complaint(const tss_net_def *d) {
     if (d->layers < 1 || d->layers > TSS__NET_LAYERS) return "network: layers must be 1..64";
     if (!d->width) return "network: no widths";
     for (int l = 0; l <= d->layers; l++)
-        if (d->width[l] < 1 || d->width[l] > (1 << 26)) return "network: a width is outside 1..2^26";
+        if (d->width[l] < 1 || d->width[l] > (1 << 26))
+            return "network: a width is outside 1..2^26";
     if ((unsigned)d->activation >= TSS_ACTIVATIONS) return "network: unknown activation";
-    if (d->in_matrix && (d->inputs < 1 || d->inputs > (1 << 28))) return "network: inputs must be 1..2^28";
+    if (d->in_matrix && (d->inputs < 1 || d->inputs > (1 << 28)))
+        return "network: inputs must be 1..2^28";
     if (!d->in_matrix && d->in_base) return "network: in_base without in_matrix";
     int last = d->width[d->layers];
     if (d->outputs < 0 || d->outputs > (1 << 28)) return "network: outputs must be 0..2^28";
@@ -630,7 +721,8 @@ static const char *tss__net_complaint(const tss_net_def *d) {
     if (d->outputs == 0 || d->out_matrix) return NULL;
     if (!d->out_index && d->outputs != last) return "network: outputs differ from the last width";
     for (int i = 0; d->out_index && i < last; i++)
-        if (d->out_index[i] < 0 || d->out_index[i] >= d->outputs) return "network: out_index out of range";
+        if (d->out_index[i] < 0 || d->out_index[i] >= d->outputs)
+            return "network: out_index out of range";
     return NULL;
 }
 
@@ -756,13 +848,13 @@ void tss_net_set_scale(tss_net *n, double s) { n->scale = s; }
 typedef struct tss__jetpass {
     const tss_net *net;
     int batch, k, second, cols, chunks;
-    size_t coords;     // columns of x: all outputs, or those of dof
-    const int *dof;    // coordinates wanted, NULL: all
-    const double *C;   // batch × k × k, or NULL
-    double *act, *pre;  // tapes: layer l at rows·off[l]
-    double *x, *xbar;   // rows × coords
-    double *theta;      // chunks × parameters, or NULL
-    double *scratch;    // chunks × scratch_each
+    size_t coords;              // columns of x: all outputs, or those of dof
+    const int *dof;             // coordinates wanted, NULL: all
+    const double *C;            // batch × k × k, or NULL
+    double *act, *pre;          // tapes: layer l at rows·off[l]
+    double *x, *xbar;           // rows × coords
+    double *theta;              // chunks × parameters, or NULL
+    double *scratch;            // chunks × scratch_each
     size_t most, scratch_each;  // most: rows of a chunk
 } tss__jetpass;
 
@@ -785,8 +877,8 @@ static double *tss__jetpass_layer(const tss__jetpass *p, double *tape, int c, in
 
 enum { TSS__PASS_X = 1, TSS__PASS_XBAR = 2, TSS__PASS_THETA = 4 };
 
-static tss__jetpass tss__jetpass_of(const tss_net *n, int batch, int k, const double *C, const int *dof,
-                              int coords) {
+static tss__jetpass tss__jetpass_of(const tss_net *n, int batch, int k, const double *C,
+                                    const int *dof, int coords) {
     tss__jetpass p;
     memset(&p, 0, sizeof p);
     p.net = n, p.batch = batch, p.k = k, p.second = C != NULL, p.C = C;
@@ -827,7 +919,7 @@ static double *tss__jetpass_panel(const tss__jetpass *p, int c) {
 
 // The chunk's inputs: rows of `in`, directions D (sample s's at s·stride), 0 for the second order.
 static void tss__jetpass_load(const tss__jetpass *p, int c, const double *in, const double *D,
-                           size_t stride) {
+                              size_t stride) {
     const tss_net *n = p->net;
     size_t r = (size_t)n->width[0], full = (size_t)n->inputs;
     double *to = tss__jetpass_layer(p, p->act, c, 0), *panel = tss__jetpass_panel(p, c);
@@ -845,12 +937,13 @@ static void tss__jetpass_load(const tss__jetpass *p, int c, const double *in, co
             memcpy(row + r, D + (size_t)(first + s) * stride, (size_t)p->k * r * sizeof(double));
     }
     if (n->has_in)
-        tss__n_product((size_t)count, r, full, tss__n_rows(moved, full), tss__n_rows(n->in_matrix, r),
-                       to, r, panel);
+        tss__n_product((size_t)count, r, full, tss__n_rows(moved, full),
+                       tss__n_rows(n->in_matrix, r), to, r, panel);
 }
 
 // hat[a] = Σ_b C_ab s_b of one sample; s: its rows, width w.
-static void tss__jetpass_hats(const tss__jetpass *p, int sample, const double *s, size_t w, double *hat) {
+static void tss__jetpass_hats(const tss__jetpass *p, int sample, const double *s, size_t w,
+                              double *hat) {
     const double *C = p->C + (size_t)sample * (size_t)(p->k * p->k);
     tss__n_zero(hat, (size_t)p->k * w);
     for (int a = 0; a < p->k; a++)
@@ -942,7 +1035,8 @@ static void tss__jetpass_theta(const tss__jetpass *p, int c, int l, const double
     const tss_net *n = p->net;
     size_t in = (size_t)n->width[l], out = (size_t)n->width[l + 1], rows = tss__jetpass_rows(p, c);
     double *W = p->theta + (size_t)c * n->theta[n->layers] + n->theta[l], *b = W + in * out;
-    tss__n_product(in, out, rows, tss__n_turned(tss__n_rows(tss__jetpass_layer(p, p->act, c, l), in)),
+    tss__n_product(in, out, rows,
+                   tss__n_turned(tss__n_rows(tss__jetpass_layer(p, p->act, c, l), in)),
                    tss__n_rows(bar, out), W, out, tss__jetpass_panel(p, c));
     for (size_t r = 0; r < rows; r += (size_t)p->cols)
         for (size_t o = 0; o < out; o++) b[o] += bar[r * out + o];
@@ -1008,8 +1102,7 @@ static void tss__jetpass_in_bar(const tss__jetpass *p, int c, const double *xbar
         for (size_t t = 0; t < T; t++) {
             size_t at = p->dof ? (size_t)p->dof[t] : t;
             int from = n->map == TSS__MAP_SCATTER ? n->from[at] : (int)at;
-            if (from >= 0)
-                bar[r * w + (size_t)from] += (n->map ? n->scale : 1) * xbar[r * T + t];
+            if (from >= 0) bar[r * w + (size_t)from] += (n->map ? n->scale : 1) * xbar[r * T + t];
         }
 }
 
@@ -1035,7 +1128,8 @@ static void tss__n_sum_task(int block, int worker, void *arg) {
     }
 }
 
-static void tss__jetpass_collect(const tss_host *host, const tss__jetpass *p, double weight, double *to) {
+static void tss__jetpass_collect(const tss_host *host, const tss__jetpass *p, double weight,
+                                 double *to) {
     tss__n_sum s = {p, weight, to};
     size_t all = p->net->theta[p->net->layers];
     if (to) tss_parallel(host, (int)((all + 4095) / 4096), tss__n_sum_task, &s);
@@ -1084,7 +1178,8 @@ tss_result tss_net_jets(const tss_net *n, tss_work *w, int batch, int k, const d
     return TSS_OK;
 }
 
-tss_result tss_net_forward(const tss_net *n, tss_work *w, int batch, const double *in, double *out) {
+tss_result tss_net_forward(const tss_net *n, tss_work *w, int batch, const double *in,
+                           double *out) {
     return tss_net_jets(n, w, batch, 0, in, NULL, NULL, out, NULL, NULL);
 }
 
@@ -1096,12 +1191,12 @@ static void tss__jetpass_inputs(const tss__jetpass *p, int c, const double *bar,
     double *to = in_bar + (size_t)first * full;
     if (n->has_in) {
         tss__n_product((size_t)count, full, r, tss__n_rows(bar, r),
-                       tss__n_turned(tss__n_rows(n->in_matrix, r)), to, full, tss__jetpass_panel(p, c));
+                       tss__n_turned(tss__n_rows(n->in_matrix, r)), to, full,
+                       tss__jetpass_panel(p, c));
         return;
     }
     for (int s = 0; s < count; s++)
-        for (size_t i = 0; i < r; i++)
-            to[(size_t)s * r + i] += bar[(size_t)(s * p->cols) * r + i];
+        for (size_t i = 0; i < r; i++) to[(size_t)s * r + i] += bar[(size_t)(s * p->cols) * r + i];
 }
 
 static void tss__n_backward_task(int c, int worker, void *arg) {
@@ -1136,13 +1231,15 @@ tss_result tss_net_backward(const tss_net *n, tss_work *w, int batch, const doub
 // >>neural_elements (private)
 // With G = F − I, j = J − 1, K = cof F, and II, III the second and third invariants:
 //     Ψ = μ/2 (‖G‖² − 2 II(G) − 2 III(G)) + λ'/2 j²,  j = tr G + II(G) + III(G),
-// without cancellation near rest. Where the strain δ = FᵀF − I is small, however far the cell has turned,
+// without cancellation near rest. Where the strain δ = FᵀF − I is small, however far the cell has
+// turned,
 //     Ψ = μ/2 (j² − II(δ) − III(δ)) + λ'/2 j²,  j = (tr + II + III)(δ) / (1 + J)
 // has a rounding of μ|δ| and not of μ (it follows from J² = det(I + δ)). Derivatives:
 //     Ψ'      = μ (F − K) + λ' j K
 //     Ψ''[A]  = μ A + λ' (K:A) K + c K'[A],   c = λ' j − μ
 //     Ψ'''[A, B] = λ' ((K:A) K'[B] + (K:B) K'[A] + (K'[A]:B) K) + c K''[A, B].
-// In 3D K'[A] = F ⨯ A and K''[A, B] = A ⨯ B (the tensor cross product, ½ F ⨯ F = K); in 2D K is linear.
+// In 3D K'[A] = F ⨯ A and K''[A, B] = A ⨯ B (the tensor cross product, ½ F ⨯ F = K); in 2D K is
+// linear.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__ELEMENTS_COOKIE 0x656c65
@@ -1175,11 +1272,16 @@ static void tss__cof2(const double A[4], double out[4]) {
 
 // K'[A] at F, and K''[A, B].
 static void tss__cof_d(int d, const double *F, const double *A, double *out) {
-    if (d == 3) tss__mat_cross(F, A, out); else tss__cof2(A, out);
+    if (d == 3)
+        tss__mat_cross(F, A, out);
+    else
+        tss__cof2(A, out);
 }
 static void tss__cof_dd(int d, const double *A, const double *B, double *out) {
-    if (d == 3) tss__mat_cross(A, B, out);
-    else out[0] = out[1] = out[2] = out[3] = 0;
+    if (d == 3)
+        tss__mat_cross(A, B, out);
+    else
+        out[0] = out[1] = out[2] = out[3] = 0;
 }
 
 static double tss__dot_n(int n, const double *a, const double *b) {
@@ -1250,8 +1352,8 @@ static void tss__cell_ddd(const tss__n_cell *q, double w, const double *A, const
     for (int i = 0; i < q->dd; i++) out[i] += w * (q->la * (D[i] + ab * q->K[i]) + q->c * E[i]);
 }
 
-void tss_neural_density(void *user, int dim, int count, const int *cell, const double *F, double *psi,
-                        double *P, double *C) {
+void tss_neural_density(void *user, int dim, int count, const int *cell, const double *F,
+                        double *psi, double *P, double *C) {
     const double *lame = (const double *)user;
     int dd = dim * dim;
     (void)cell;
@@ -1283,19 +1385,23 @@ static const char *tss__elements_complaint(const tss_elements_def *d, tss_result
     if (d->nodes < 1 || d->nodes > (1 << 28) || d->cells < 1 || d->cells > (1 << 28) || count < 1 ||
         count > d->cells)
         return "elements: nodes, cells and the subset must not be empty";
-    if (!d->X || !d->cell || !d->mu != !d->lambda) return "elements: X, cell or one of mu, lambda missing";
+    if (!d->X || !d->cell || !d->mu != !d->lambda)
+        return "elements: X, cell or one of mu, lambda missing";
     for (int i = 0; d->subset && i < count; i++)
         if (d->subset[i] < 0 || d->subset[i] >= d->cells) return "elements: subset out of range";
     for (int i = 0; d->weight && i < count; i++)
-        if (!(d->weight[i] >= 0 && d->weight[i] < 1e300)) return "elements: a weight is negative or not finite";
+        if (!(d->weight[i] >= 0 && d->weight[i] < 1e300))
+            return "elements: a weight is negative or not finite";
     *r = TSS_ERROR_BAD_MATERIAL;
-    if (!d->mu && !(d->E > 0 && d->E < 1e300 && d->nu > -1 && d->nu < 0.5)) return "elements: E or nu out of range";
+    if (!d->mu && !(d->E > 0 && d->E < 1e300 && d->nu > -1 && d->nu < 0.5))
+        return "elements: E or nu out of range";
     for (int i = 0; d->mu && i < d->cells; i++)
         if (!(d->mu[i] > 0 && d->mu[i] < 1e300 && d->lambda[i] > -d->mu[i] && d->lambda[i] < 1e300))
             return "elements: mu must be > 0 and lambda > −mu";
     *r = TSS_ERROR_BAD_MESH;
     for (int i = 0; i < d->cells * (d->dim + 1); i++)
-        if (d->cell[i] < 0 || d->cell[i] >= d->nodes) return "elements: a cell names a node out of range";
+        if (d->cell[i] < 0 || d->cell[i] >= d->nodes)
+            return "elements: a cell names a node out of range";
     for (int i = 0; i < d->nodes * d->dim; i++)
         if (!isfinite(d->X[i])) return "elements: a rest position is not finite";
     return NULL;
@@ -1353,19 +1459,22 @@ static tss_elements *tss__elements_alloc(const tss_host *h, const tss_elements_d
     e->host = *h, e->dim = d->dim, e->nodes = d->nodes, e->cells = d->subset ? d->count : d->cells;
     size_t m = (size_t)e->cells, dim = (size_t)d->dim, most = (size_t)d->nodes;
     if (m * (dim + 1) < most) most = m * (dim + 1);  // nodes that can be used
-    e->bytes = m * (dim * dim + 3) * sizeof(double) + (2 * m * (dim + 1) + most * dim) * sizeof(int);
+    e->bytes =
+        m * (dim * dim + 3) * sizeof(double) + (2 * m * (dim + 1) + most * dim) * sizeof(int);
     e->p = tss_alloc(h, e->bytes);
     if (!e->p) {
         tss_elements_destroy(e);
         return NULL;
     }
-    e->Dinv = (double *)e->p, e->vol = e->Dinv + m * dim * dim, e->mu = e->vol + m, e->la = e->mu + m;
+    e->Dinv = (double *)e->p, e->vol = e->Dinv + m * dim * dim, e->mu = e->vol + m,
+    e->la = e->mu + m;
     e->cell = (int *)(void *)(e->la + m), e->local = e->cell + m * (dim + 1);
     e->dof = e->local + m * (dim + 1);
     return e;
 }
 
-tss_result tss_elements_create(const tss_host *host, const tss_elements_def *d, tss_elements **out) {
+tss_result tss_elements_create(const tss_host *host, const tss_elements_def *d,
+                               tss_elements **out) {
     tss_host h = host ? *host : tss_host_default();
     tss_result r;
     *out = NULL;
@@ -1398,8 +1507,8 @@ typedef struct tss__n_jet {  // one sample; rows of x: base, k, second
     const int *cell;  // e->cell or e->local: how rows are numbered
     int mode, k, second;
     const double *x;
-    size_t ld;         // from row to row
-    const double *C;   // k × k, or NULL
+    size_t ld;        // from row to row
+    const double *C;  // k × k, or NULL
     double alpha, gamma;
     const double *beta;  // k, or NULL: 0
     double *bar;         // rows as x, added to; NULL: VALUE
@@ -1440,7 +1549,8 @@ static void tss__jet_scatter(const tss__n_jet *t, int k, int cols, const double 
 }
 
 // F̂_a = Σ_b C_ab F_b, and the second-order value Σ_a Ψ''[F_a, F̂_a] + Ψ':F_2.
-static double tss__jet_second(const tss__n_jet *t, const tss__n_cell *q, const double *F, double *hat) {
+static double tss__jet_second(const tss__n_jet *t, const tss__n_cell *q, const double *F,
+                              double *hat) {
     double s = tss__dot_n(q->dd, q->P, F + 9 * (t->k + 1));
     for (int a = 0; a < t->k; a++) {
         double *h = hat + 9 * a, D[9] = {0};
@@ -1476,7 +1586,8 @@ static void tss__jet_reverse(const tss__n_jet *t, const tss__n_cell *q, const do
 }
 
 // The adjoint of P and its derivatives along the F_a.
-static void tss__jet_tangent(const tss__n_jet *t, const tss__n_cell *q, const double *F, double *bar) {
+static void tss__jet_tangent(const tss__n_jet *t, const tss__n_cell *q, const double *F,
+                             double *bar) {
     memcpy(bar, q->P, (size_t)q->dd * sizeof(double));
     for (int a = 1; a <= t->k; a++) {
         tss__n_zero(bar + 9 * a, 9);
@@ -1529,7 +1640,8 @@ tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, cons
     tss__n_zero(p, count);
     tss__n_jet t;
     memset(&t, 0, sizeof t);
-    t.e = e, t.cell = e->cell, t.mode = TSS__CELL_REVERSE, t.k = k, t.second = C != NULL, t.x = p, t.ld = n;
+    t.e = e, t.cell = e->cell, t.mode = TSS__CELL_REVERSE, t.k = k, t.second = C != NULL, t.x = p,
+    t.ld = n;
     t.C = C, t.alpha = alpha, t.beta = beta, t.gamma = gamma, t.bar = p + cols * n, t.P1 = P1;
     t.scratch = t.bar + cols * n;
     memcpy(p, x, wide);
@@ -1547,8 +1659,9 @@ tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, cons
 
 // ---------------------------------------------------------------------------------------------
 // >>reduced (private)
-// One job serves all that is asked of P(f(z)): values, reverse passes with seeds, and Hessians times
-// directions (the tangent of the reverse pass). Only the coordinates that elements touch are made.
+// One job serves all that is asked of P(f(z)): values, reverse passes with seeds, and Hessians
+// times directions (the tangent of the reverse pass). Only the coordinates that elements touch are
+// made.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss__n_reduced {
@@ -1556,13 +1669,13 @@ typedef struct tss__n_reduced {
     const tss_elements *e;
     int mode;
     const double *z, *D;
-    size_t stride;      // of D from sample to sample
-    const double *alpha;  // batch, or NULL: all_alpha
+    size_t stride;                  // of D from sample to sample
+    const double *alpha;            // batch, or NULL: all_alpha
     double all_alpha, beta, gamma;  // beta: of each direction
-    double *betas;      // k times beta
-    double *P, *P2;     // batch, or NULL
-    double *gradient;   // batch × r: of the seeded sum in z (TANGENT: ∇P); overwritten; or NULL
-    double *HD;         // TANGENT: batch × k × r, or NULL
+    double *betas;                  // k times beta
+    double *P, *P2;                 // batch, or NULL
+    double *gradient;  // batch × r: of the seeded sum in z (TANGENT: ∇P); overwritten; or NULL
+    double *HD;        // TANGENT: batch × k × r, or NULL
     double *cell_scratch;
 } tss__n_reduced;
 
@@ -1581,7 +1694,7 @@ static void tss__reduced_init(tss__n_reduced *j, const tss_net *n, const tss_ele
 static void tss__reduced_plan(tss__n_reduced *j, tss__n_slab *s, int theta) {
     int reverse = j->mode != TSS__CELL_VALUE;
     tss__jetpass_plan(&j->p, s,
-                   TSS__PASS_X | (reverse ? TSS__PASS_XBAR : 0) | (theta ? TSS__PASS_THETA : 0));
+                      TSS__PASS_X | (reverse ? TSS__PASS_XBAR : 0) | (theta ? TSS__PASS_THETA : 0));
     j->cell_scratch = tss__n_take(s, j->p.chunks, (size_t)(3 * j->p.cols + 2) * 9);
     j->betas = tss__n_take(s, 1, (size_t)j->p.k);
 }
@@ -1589,7 +1702,8 @@ static void tss__reduced_plan(tss__n_reduced *j, tss__n_slab *s, int theta) {
 static void tss__reduced_elements(tss__n_reduced *j, int c) {
     const tss__jetpass *p = &j->p;
     int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
-    if (j->mode != TSS__CELL_VALUE) tss__n_zero(tss__jetpass_xbar(p, c), tss__jetpass_rows(p, c) * p->coords);
+    if (j->mode != TSS__CELL_VALUE)
+        tss__n_zero(tss__jetpass_xbar(p, c), tss__jetpass_rows(p, c) * p->coords);
     for (int i = first; i < first + count; i++) {
         size_t row = (size_t)i * (size_t)p->cols * p->coords;
         tss__n_jet t;
@@ -1643,9 +1757,11 @@ tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_wo
     tss__n_slab s = {NULL, 0, 0};
     int r = n->width[0], k = hessian ? r : 0;
     double *D = NULL;
-    tss__reduced_init(&j, n, e, hessian    ? TSS__CELL_TANGENT
-                                : gradient ? TSS__CELL_REVERSE
-                                           : TSS__CELL_VALUE, batch, k, NULL);
+    tss__reduced_init(&j, n, e,
+                      hessian    ? TSS__CELL_TANGENT
+                      : gradient ? TSS__CELL_REVERSE
+                                 : TSS__CELL_VALUE,
+                      batch, k, NULL);
     for (int pass = 0; pass < 2; pass++) {
         tss__reduced_plan(&j, &s, 0);
         D = tss__n_take(&s, k, (size_t)r);
@@ -1707,7 +1823,8 @@ static void tss__recon_task(int c, int worker, void *arg) {
     for (int s = first; s < first + count; s++) {
         double sum = 0;
         for (size_t i = 0; i < n; i++) {
-            double m = j->mass ? j->mass[i] : 1, gap = d->x[(size_t)s * n + i] - j->x[(size_t)s * n + i];
+            double m = j->mass ? j->mass[i] : 1,
+                   gap = d->x[(size_t)s * n + i] - j->x[(size_t)s * n + i];
             sum += m * gap * gap;
             d->xbar[(size_t)s * n + i] = 2 * m * gap / d->batch;
         }
@@ -1732,7 +1849,8 @@ tss_result tss_loss_reconstruction(const tss_net *dec, const tss_net *enc, tss_w
     j.dec = tss__jetpass_of(dec, batch, 0, NULL, NULL, 0);
     for (int pass = 0; pass < 2; pass++) {
         tss__jetpass_plan(&j.enc, &s, TSS__PASS_X | (encoder_bar ? TSS__PASS_THETA : 0));
-        tss__jetpass_plan(&j.dec, &s, TSS__PASS_X | TSS__PASS_XBAR | (decoder_bar ? TSS__PASS_THETA : 0));
+        tss__jetpass_plan(&j.dec, &s,
+                          TSS__PASS_X | TSS__PASS_XBAR | (decoder_bar ? TSS__PASS_THETA : 0));
         j.loss = tss__n_take(&s, batch, 1);
         if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
     }
@@ -1797,7 +1915,8 @@ tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_
                                  const double *mass, double lambda, double sigma, double eps,
                                  int batch, const double *z, double weight, double *loss,
                                  double *parts, double *decoder_bar) {
-    if (batch < 2 || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0)) return TSS_ERROR_BAD_ARGUMENT;
+    if (batch < 2 || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
+        return TSS_ERROR_BAD_ARGUMENT;
     tss__n_unsup j;
     tss__n_slab s = {NULL, 0, 0};
     tss__reduced_init(&j.r, dec, e, TSS__CELL_REVERSE, batch, 0, NULL);
@@ -1823,10 +1942,12 @@ tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_
 
 // ---------------------------------------------------------------------------------------------
 // >>lipschitz (private)
-// Every variant is the mean over pairs of ‖φ_i − φ_j‖² / ‖z_i − z_j‖² for some features φ of a sample:
-//     order 0: P;  1: ∇P;  2: ∇²P;  UV: uᵀ∇²P v;  U: ∇²P u   (probes: side by side, divided by √probes)
-// A first pass gives φ; pairs give φ̄; a second pass gives the gradient of ⟨φ̄, φ⟩ for fixed φ̄, which
-// is one jet: α = φ̄;  D = φ̄, β = 1;  D = I, C = φ̄;  D = (u, w), C = [0 ½; ½ 0] with w = φ̄ v or φ̄.
+// Every variant is the mean over pairs of ‖φ_i − φ_j‖² / ‖z_i − z_j‖² for some features φ of a
+// sample:
+//     order 0: P;  1: ∇P;  2: ∇²P;  UV: uᵀ∇²P v;  U: ∇²P u   (probes: side by side, divided by
+//     √probes)
+// A first pass gives φ; pairs give φ̄; a second pass gives the gradient of ⟨φ̄, φ⟩ for fixed φ̄. That
+// is one jet: α = φ̄;  D = φ̄, β = 1;  D = I, C = φ̄;  D = (u, w), C = [0 ½; ½ 0], w = φ̄ v or φ̄.
 // ---------------------------------------------------------------------------------------------
 
 tss_lipschitz_def tss_lipschitz_def_default(void) {
@@ -1841,10 +1962,10 @@ typedef struct tss__n_lip {
     int batch, r, m, k;  // features; directions of the second pass
     tss__n_reduced first, second;
     const double *z, *probe;
-    double *phi, *bar;    // batch × m
-    double *zbar;         // batch × r, of the distances
-    double *zjet;         // batch × r, of the features
-    double *loss;         // batch
+    double *phi, *bar;  // batch × m
+    double *zbar;       // batch × r, of the distances
+    double *zjet;       // batch × r, of the features
+    double *loss;       // batch
     double *HD, *D1, *D, *C;
 } tss__n_lip;
 
@@ -1860,10 +1981,13 @@ static void tss__lip_init(tss__n_lip *l, const tss_net *n, const tss_elements *e
     l->m = order == 0 ? 1 : order == 1 ? r : def->estimator == TSS_LIPSCHITZ_UV ? k1 : k1 * r;
     // Once the probes' vectors are as many as r, the coordinates serve as well.
     l->k = order < 2 ? order : random && 2 * k1 < r ? 2 * k1 : r;
-    tss__reduced_init(&l->first, n, e, order == 0   ? TSS__CELL_VALUE
-                                       : order == 1 ? TSS__CELL_REVERSE
-                                                    : TSS__CELL_TANGENT, batch, k1, NULL);
-    tss__reduced_init(&l->second, n, e, TSS__CELL_REVERSE, batch, l->k, order == 2 ? &marker : NULL);
+    tss__reduced_init(&l->first, n, e,
+                      order == 0   ? TSS__CELL_VALUE
+                      : order == 1 ? TSS__CELL_REVERSE
+                                   : TSS__CELL_TANGENT,
+                      batch, k1, NULL);
+    tss__reduced_init(&l->second, n, e, TSS__CELL_REVERSE, batch, l->k,
+                      order == 2 ? &marker : NULL);
 }
 
 static void tss__lip_plan(tss__n_lip *l, tss__n_slab *s, int reverse, int theta) {
@@ -1949,15 +2073,18 @@ static void tss__lip_jet(tss__n_lip *l, size_t i) {
         }
         const double *u = l->probe + 2 * p * r, *v = u + r, *w = v;
         double f = share;
-        if (l->def.estimator == TSS_LIPSCHITZ_UV) f *= l->bar[i * K + p];
-        else w = l->bar + (i * K + p) * r;
+        if (l->def.estimator == TSS_LIPSCHITZ_UV)
+            f *= l->bar[i * K + p];
+        else
+            w = l->bar + (i * K + p) * r;
         if (direct) {
             memcpy(D + 2 * p * r, u, r * sizeof(double));
             for (size_t a = 0; a < r; a++) D[(2 * p + 1) * r + a] = f * w[a];
             C[2 * p * k + 2 * p + 1] = C[(2 * p + 1) * k + 2 * p] = 0.5;
         } else {
             for (size_t a = 0; a < r; a++)
-                for (size_t b = 0; b < r; b++) C[a * r + b] += 0.5 * f * (u[a] * w[b] + w[a] * u[b]);
+                for (size_t b = 0; b < r; b++)
+                    C[a * r + b] += 0.5 * f * (u[a] * w[b] + w[a] * u[b]);
         }
     }
 }
@@ -2041,6 +2168,262 @@ tss_result tss_lipschitz_estimate(const tss_net *dec, const tss_elements *e, tss
 }
 
 // ---------------------------------------------------------------------------------------------
+// >>cubature (private)
+// min ‖G w − b‖, w >= 0, with at most `count` weights: G has a column of samples · r numbers for
+// each candidate. The normal equations of the chosen columns are kept with their Cholesky factor,
+// which grows by a row a cell and is made anew when one leaves.
+// ---------------------------------------------------------------------------------------------
+
+tss_cubature_def tss_cubature_def_default(void) {
+    tss_cubature_def d = {300, 0, 0, 0};
+    return d;
+}
+
+typedef struct tss__cub {
+    const tss_host *host;
+    int candidates, most, chosen;
+    size_t m;
+    double *G, *norm, *b, *rest, *match;  // columns, their norms; b; b − G w; Gᵀ rest / norm
+    double *A, *L, *rhs, *w, *s;          // most × most twice, then most each
+    int *cell, *in;                       // of each candidate; candidates chosen
+    uint8_t *out;                         // 1: chosen, or of no use
+} tss__cub;
+
+static void tss__cub_match_task(int block, int worker, void *arg) {
+    (void)worker;
+    tss__cub *c = (tss__cub *)arg;
+    int end = 64 * (block + 1) < c->candidates ? 64 * (block + 1) : c->candidates;
+    for (int k = 64 * block; k < end; k++)
+        c->match[k] =
+            c->out[k] ? 0 : tss__dot_n((int)c->m, c->G + (size_t)k * c->m, c->rest) / c->norm[k];
+}
+
+static void tss__cub_residual(tss__cub *c) {
+    memcpy(c->rest, c->b, c->m * sizeof(double));
+    for (int i = 0; i < c->chosen; i++) {
+        const double *g = c->G + (size_t)c->in[i] * c->m;
+        for (size_t k = 0; k < c->m; k++) c->rest[k] -= c->w[i] * g[k];
+    }
+}
+
+// Row i of the factor, from row i of A. 0: the column depends on those before it.
+static int tss__cub_factor_row(tss__cub *c, int i) {
+    size_t ld = (size_t)c->most;
+    double *row = c->L + (size_t)i * ld;
+    const double *A = c->A + (size_t)i * ld;
+    for (int j = 0; j <= i; j++) {
+        const double *lj = c->L + (size_t)j * ld;
+        double s = A[j] - tss__dot_n(j, row, lj);
+        if (j < i)
+            row[j] = s / lj[j];
+        else if (!(s > 1e-10 * A[i]))
+            return 0;
+        else
+            row[i] = sqrt(s);
+    }
+    return 1;
+}
+
+static int tss__cub_push(tss__cub *c, int candidate) {
+    const double *g = c->G + (size_t)candidate * c->m;
+    int i = c->chosen;
+    c->in[i] = candidate, c->out[candidate] = 1;
+    for (int j = 0; j <= i; j++)
+        c->A[(size_t)i * (size_t)c->most + (size_t)j] =
+            tss__dot_n((int)c->m, g, c->G + (size_t)c->in[j] * c->m);
+    c->rhs[i] = tss__dot_n((int)c->m, g, c->b), c->w[i] = 0;
+    if (!tss__cub_factor_row(c, i)) return 0;
+    c->chosen++;
+    return 1;
+}
+
+static void tss__cub_solve(tss__cub *c) {
+    size_t ld = (size_t)c->most;
+    for (int i = 0; i < c->chosen; i++)
+        c->s[i] = (c->rhs[i] - tss__dot_n(i, c->L + (size_t)i * ld, c->s)) /
+                  c->L[(size_t)i * ld + (size_t)i];
+    for (int i = c->chosen - 1; i >= 0; i--) {
+        double s = c->s[i];
+        for (int j = i + 1; j < c->chosen; j++) s -= c->L[(size_t)j * ld + (size_t)i] * c->s[j];
+        c->s[i] = s / c->L[(size_t)i * ld + (size_t)i];
+    }
+}
+
+// Takes out the cells whose weight has reached 0.
+static void tss__cub_drop(tss__cub *c) {
+    size_t ld = (size_t)c->most;
+    int to = 0;
+    for (int i = 0; i < c->chosen; i++) {
+        if (!(c->w[i] > 0)) {
+            c->out[c->in[i]] = 0;
+            continue;
+        }
+        // Rows and columns move up; what is read lies behind what is written.
+        for (int j = 0, at = 0; j <= i; j++) {
+            if (!(c->w[j] > 0)) continue;
+            c->A[(size_t)to * ld + (size_t)at++] = c->A[(size_t)i * ld + (size_t)j];
+        }
+        to++;
+    }
+    for (int i = 0, at = 0; i < c->chosen; i++)
+        if (c->w[i] > 0) c->in[at] = c->in[i], c->rhs[at] = c->rhs[i], c->w[at++] = c->w[i];
+    c->chosen = to;
+    for (int i = 0; i < to; i++) tss__cub_factor_row(c, i);
+}
+
+// Moves w to the least-squares weights as far as none turns negative, until they are reached.
+static void tss__cub_weights(tss__cub *c) {
+    for (;;) {
+        double t = 1;
+        int block = -1;
+        tss__cub_solve(c);
+        for (int i = 0; i < c->chosen; i++)
+            if (c->s[i] <= 0 && c->w[i] <= t * (c->w[i] - c->s[i]))
+                t = c->w[i] / (c->w[i] - c->s[i]), block = i;
+        for (int i = 0; i < c->chosen; i++) c->w[i] += t * (c->s[i] - c->w[i]);
+        if (block < 0) return;
+        c->w[block] = 0;
+        tss__cub_drop(c);
+    }
+}
+
+static double tss__cub_run(tss__cub *c, double tol) {
+    double all = sqrt(tss__dot_n((int)c->m, c->b, c->b)), error = all > 0 ? 1 : 0;
+    // A round may end with as many cells as before: the bound is for those.
+    for (int round = 0; round < 4 * c->most && c->chosen < c->most && error > tol; round++) {
+        int best = -1;
+        tss_parallel(c->host, (c->candidates + 63) / 64, tss__cub_match_task, c);
+        for (int k = 0; k < c->candidates; k++)
+            if (c->match[k] > 1e-12 * all && (best < 0 || c->match[k] > c->match[best])) best = k;
+        if (best < 0) break;                    // no cell would help: the optimum with w >= 0
+        if (!tss__cub_push(c, best)) continue;  // depends on the others: never tried again
+        tss__cub_weights(c);
+        if (!c->out[best])
+            c->out[best] = 1;  // left at once: rounding, and would come back for ever
+        tss__cub_residual(c);
+        error = sqrt(tss__dot_n((int)c->m, c->rest, c->rest)) / all;
+    }
+    return error;
+}
+
+typedef struct tss__cub_fill {  // one sample's rows of G
+    tss__cub *c;
+    const tss_elements *e;
+    const double *x;  // f(z), then its r derivatives
+    int r;
+    size_t n, first;
+    double scale;
+} tss__cub_fill;
+
+static void tss__cub_fill_task(int block, int worker, void *arg) {
+    (void)worker;
+    tss__cub_fill *f = (tss__cub_fill *)arg;
+    tss__cub *c = f->c;
+    const tss_elements *e = f->e;
+    int end = 64 * (block + 1) < c->candidates ? 64 * (block + 1) : c->candidates;
+    for (int k = 64 * block; k < end; k++) {
+        double F[9];
+        tss__n_cell q;
+        tss__n_jet t;
+        memset(&t, 0, sizeof t);
+        int cell = c->cell[k];
+        t.e = e, t.cell = e->cell, t.x = f->x, t.ld = f->n;
+        tss__jet_gather(&t, cell, 1, F);
+        tss__cell_at(&q, e->dim, e->mu[cell], e->la[cell], F);
+        for (int a = 0; a < f->r; a++) {
+            t.x = f->x + (size_t)(a + 1) * f->n;
+            tss__jet_gather(&t, cell, 1, F);
+            c->G[(size_t)k * c->m + f->first + (size_t)a] =
+                f->scale * e->vol[cell] * tss__dot_n(q.dd, q.P, F);
+        }
+    }
+}
+
+// b, G and norms. x: (1 + r)·n doubles, D: r² of them.
+static tss_result tss__cub_system(tss__cub *c, const tss_net *n, const tss_elements *e, tss_work *w,
+                                  int samples, const double *z, double *x, double *D) {
+    size_t r = (size_t)n->inputs, coords = (size_t)n->outputs;
+    tss_result result = tss_reduced_potential(n, e, w, samples, z, NULL, c->b, NULL);
+    tss__n_identity(D, (int)r);
+    for (size_t t = 0; result == TSS_OK && t < (size_t)samples; t++) {
+        double *b = c->b + t * r, size = sqrt(tss__dot_n((int)r, b, b));
+        tss__cub_fill f = {c, e, x, (int)r, coords, t * r, size > 0 ? 1 / size : 0};
+        for (size_t a = 0; a < r; a++) b[a] *= f.scale;
+        result = tss_net_jets(n, w, 1, (int)r, z + t * r, D, NULL, x, x + coords, NULL);
+        if (result == TSS_OK)
+            tss_parallel(&w->host, (c->candidates + 63) / 64, tss__cub_fill_task, &f);
+    }
+    for (int k = 0; result == TSS_OK && k < c->candidates; k++) {
+        const double *g = c->G + (size_t)k * c->m;
+        c->norm[k] = sqrt(tss__dot_n((int)c->m, g, g));
+        c->out[k] = !(c->norm[k] > 0);
+    }
+    memcpy(c->rest, c->b, c->m * sizeof(double));
+    return result;
+}
+
+// Draws the candidates: the head of a shuffle, in ascending order so that all cells need no
+// shuffle.
+static void tss__cub_draw(tss__cub *c, const tss_elements *e, uint64_t seed) {
+    tss_rng r = tss_rng_seed(seed);
+    int left = c->candidates, at = 0;
+    for (int k = 0; k < e->cells; k++)
+        if (tss_rng_uniform(&r) * (e->cells - k) < left) c->cell[at++] = k, left--;
+}
+
+static void tss__cub_carve(tss__cub *c, tss__n_slab *s, size_t r, size_t coords, double **x,
+                           double **D) {
+    double most = c->most, all = c->candidates;
+    c->G = tss__n_take(s, all, c->m), c->norm = tss__n_take(s, all, 1),
+    c->match = tss__n_take(s, all, 1);
+    c->b = tss__n_take(s, 1, c->m), c->rest = tss__n_take(s, 1, c->m);
+    c->A = tss__n_take(s, most, (size_t)c->most), c->L = tss__n_take(s, most, (size_t)c->most);
+    c->rhs = tss__n_take(s, most, 1), c->w = tss__n_take(s, most, 1),
+    c->s = tss__n_take(s, most, 1);
+    c->cell = (int *)(void *)tss__n_take(s, all, 1), c->in = (int *)(void *)tss__n_take(s, most, 1);
+    c->out = (uint8_t *)(void *)tss__n_take(s, all, 1);
+    *x = tss__n_take(s, (double)r + 1, coords), *D = tss__n_take(s, (double)r, r);
+}
+
+tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work *w,
+                               const tss_cubature_def *def, int samples, const double *z,
+                               int *subset, double *weight, int *count, double *error) {
+    *count = 0;
+    if (!tss__n_fits(n, e) || samples < 1 || def->count < 1 || def->candidates < 0 ||
+        !(def->tol >= 0) || (double)samples * n->inputs > 1e9)
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__cub c;
+    tss__n_slab s = {NULL, 0, 0};
+    double *x, *D;
+    size_t r = (size_t)n->inputs;
+    memset(&c, 0, sizeof c);
+    c.host = &w->host, c.m = (size_t)samples * r;
+    c.candidates = def->candidates && def->candidates < e->cells ? def->candidates : e->cells;
+    c.most = def->count < c.candidates ? def->count : c.candidates;
+    tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
+    if (s.want >= 1e15) return TSS_ERROR_NO_MEMORY;
+    // Memory of its own: the scratch of w is used by what is called.
+    size_t bytes = s.used * sizeof(double);
+    s.base = (double *)tss_alloc(&w->host, bytes);
+    if (!s.base) return TSS_ERROR_NO_MEMORY;
+    double *block = s.base;
+    s.used = 0, s.want = 0;
+    tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
+    tss__cub_draw(&c, e, def->seed);
+    tss_result result = tss__cub_system(&c, n, e, w, samples, z, x, D);
+    if (result == TSS_OK) {
+        double left = tss__cub_run(&c, def->tol);
+        if (error) *error = left;
+        for (int k = 0; k < c.candidates; k++) c.match[k] = 0;
+        for (int i = 0; i < c.chosen; i++) c.match[c.in[i]] = c.w[i];
+        for (int k = 0; k < c.candidates; k++)
+            if (c.match[k] > 0) subset[*count] = c.cell[k], weight[(*count)++] = c.match[k];
+    }
+    tss_free(&w->host, block, bytes);
+    return result;
+}
+
+// ---------------------------------------------------------------------------------------------
 // >>adam (private)
 // ---------------------------------------------------------------------------------------------
 
@@ -2114,9 +2497,7 @@ void tss_adam_update(tss_adam *a, size_t first, size_t count, double *theta, con
     }
 }
 
-void tss_adam_advance(tss_adam *a) {
-    a->t++, a->power1 *= a->def.beta1, a->power2 *= a->def.beta2;
-}
+void tss_adam_advance(tss_adam *a) { a->t++, a->power1 *= a->def.beta1, a->power2 *= a->def.beta2; }
 
 tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restart) {
     if (!tss__adam_valid(def)) return TSS_ERROR_BAD_ARGUMENT;
@@ -2129,7 +2510,8 @@ tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restart) {
 
 // ---------------------------------------------------------------------------------------------
 // >>models (private)
-// Everything is a 64-bit number, little-endian: integers and IEEE doubles. docs/neural.md has the table.
+// Everything is a 64-bit number, little-endian: integers and IEEE doubles. docs/neural.md has the
+// table.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__MODEL_MAGIC 0x0A5255454E737374u  // "tssNEUR\n"
@@ -2180,8 +2562,8 @@ static void tss__put_net(tss__n_out *o, const tss_net *n) {
 }
 
 static void tss__put_adam(tss__n_out *o, const tss_adam *a) {
-    const double d[7] = {a->def.rate, a->def.beta1, a->def.beta2, a->def.eps, a->def.decay,
-                         a->power1, a->power2};
+    const double d[7] = {a->def.rate,  a->def.beta1, a->def.beta2, a->def.eps,
+                         a->def.decay, a->power1,    a->power2};
     tss__put_doubles(o, d, 7);
     tss__put(o, a->def.decay_every), tss__put(o, a->def.warmup), tss__put(o, a->t);
     tss__put(o, a->count);
@@ -2314,7 +2696,8 @@ static tss_net *tss__get_net(tss__n_in *in, const tss_host *h, const char *name)
             tss__get_doubles(in, n->p, tss__net_parts(n, part), name);
     }
     for (int i = 0; in->result == TSS_OK && n->from && i < n->outputs; i++)
-        n->from[i] = tss__get_int(in, 0, (uint64_t)n->width[n->layers], "an output's coordinate") - 1;
+        n->from[i] =
+            tss__get_int(in, 0, (uint64_t)n->width[n->layers], "an output's coordinate") - 1;
     if (in->result == TSS_OK) return n;
     tss_net_destroy(n);
     return NULL;
@@ -2327,7 +2710,8 @@ static tss_adam *tss__get_adam(tss__n_in *in, const tss_host *h, size_t paramete
     uint64_t t, count;
     if (!tss__get_doubles(in, d, 7, "the optimiser")) return NULL;
     def.rate = d[0], def.beta1 = d[1], def.beta2 = d[2], def.eps = d[3], def.decay = d[4];
-    def.decay_every = tss__get(in), def.warmup = tss__get(in), t = tss__get(in), count = tss__get(in);
+    def.decay_every = tss__get(in), def.warmup = tss__get(in), t = tss__get(in),
+    count = tss__get(in);
     int powers = d[5] >= 0 && d[5] < 1 && d[6] >= 0 && d[6] < 1;
     if (!tss__adam_valid(&def) || !powers || count != parameters)
         tss__in_fail(in, TSS_ERROR_FORMAT, "the optimiser does not fit the networks");
@@ -2392,7 +2776,8 @@ tss_result tss_model_load(const tss_host *host, const void *data, size_t size, t
     return in.result;
 }
 
-static tss_result tss__model_store(const char *path, const char *part, const void *data, size_t size) {
+static tss_result tss__model_store(const char *path, const char *part, const void *data,
+                                   size_t size) {
     FILE *f = fopen(part, "wb");
     if (!f) return TSS_ERROR_FILE;
     size_t done = fwrite(data, 1, size, f);
@@ -2418,8 +2803,8 @@ tss_result tss_model_write(const tss_host *host, const tss_model *m, const char 
     return r;
 }
 
-// The file's bytes in memory of the host, room: what to free. Grows as it reads: the size that a file
-// system reports is not believed either.
+// The file's bytes in memory of the host, room: what to free. Grows as it reads: the size that a
+// file system reports is not believed either.
 static tss_result tss__model_fetch(const tss_host *h, const char *path, unsigned char **data,
                                    size_t *size, size_t *room) {
     FILE *f = fopen(path, "rb");
@@ -2467,8 +2852,8 @@ struct tss_training {
     tss_host host;
     tss_training_def def;
     tss_work *work;
-    size_t dec, enc;      // parameters
-    double *p;            // one block
+    size_t dec, enc;  // parameters
+    double *p;        // one block
     size_t bytes;
     double *g, *x, *z, *z_bar, *probe;  // gradients; a batch of frames; of z
 };
@@ -2476,7 +2861,8 @@ struct tss_training {
 tss_training_def tss_training_def_default(void) {
     tss_training_def d;
     memset(&d, 0, sizeof d);
-    d.batch = 32, d.lambda = d.sigma = 1, d.eps = 1e-8, d.lipschitz_batch = 16, d.through_encoder = 1;
+    d.batch = 32, d.lambda = d.sigma = 1, d.eps = 1e-8, d.lipschitz_batch = 16,
+    d.through_encoder = 1;
     d.lipschitz = tss_lipschitz_def_default(), d.adam = tss_adam_def_default();
     d.cookie = TSS__TRAINING_COOKIE;
     return d;
@@ -2490,12 +2876,17 @@ static const char *tss__training_complaint(const tss_training_def *d) {
     if (enc && (enc->outputs != dec->inputs || enc->inputs != dec->outputs))
         return "training: encoder and decoder do not fit each other";
     if (enc && (!d->frames || d->frame_count < 1)) return "training: an encoder, but no frames";
-    if (!enc && (!d->elements || d->batch < 2)) return "training: unsupervised needs elements and a batch of 2";
-    if (d->batch < 1 || d->batch > (1 << 20) || d->lipschitz_batch > (1 << 20)) return "training: batch out of range";
-    if ((d->elements && !tss__n_fits(dec, d->elements)) || (d->cubature && !tss__n_fits(dec, d->cubature)))
+    if (!enc && (!d->elements || d->batch < 2))
+        return "training: unsupervised needs elements and a batch of 2";
+    if (d->batch < 1 || d->batch > (1 << 20) || d->lipschitz_batch > (1 << 20))
+        return "training: batch out of range";
+    if ((d->elements && !tss__n_fits(dec, d->elements)) ||
+        (d->cubature && !tss__n_fits(dec, d->cubature)))
         return "training: elements and decoder have different coordinates";
-    if (!(d->sigma > 0) || !(d->eps >= 0) || !isfinite(d->lambda)) return "training: sigma, eps or lambda out of range";
-    if (!(d->lipschitz_weight >= 0 && d->lipschitz_weight < 1e300)) return "training: lipschitz_weight out of range";
+    if (!(d->sigma > 0) || !(d->eps >= 0) || !isfinite(d->lambda))
+        return "training: sigma, eps or lambda out of range";
+    if (!(d->lipschitz_weight >= 0 && d->lipschitz_weight < 1e300))
+        return "training: lipschitz_weight out of range";
     if (lip && !d->elements && !d->cubature) return "training: the Lipschitz loss needs elements";
     if (lip && !tss__lip_valid(dec, d->cubature ? d->cubature : d->elements, &d->lipschitz,
                                d->lipschitz_batch, d->frames ? d->frames : &d->sigma))
@@ -2503,7 +2894,8 @@ static const char *tss__training_complaint(const tss_training_def *d) {
     if (!tss__adam_valid(&d->adam)) return "training: Adam out of range";
     if (m->adam && m->adam->count != dec->theta[dec->layers] + (enc ? enc->theta[enc->layers] : 0))
         return "training: the optimiser does not fit the networks";
-    if (d->ramp && dec->map != TSS__MAP_SCATTER) return "training: ramp needs a decoder with out_scale";
+    if (d->ramp && dec->map != TSS__MAP_SCATTER)
+        return "training: ramp needs a decoder with out_scale";
     return NULL;
 }
 
@@ -2530,7 +2922,8 @@ static int tss__training_arrays(tss_training *t) {
                                                   &t->def.model->adam) == TSS_OK);
 }
 
-tss_result tss_training_create(const tss_host *host, const tss_training_def *def, tss_training **out) {
+tss_result tss_training_create(const tss_host *host, const tss_training_def *def,
+                               tss_training **out) {
     tss_host h = host ? *host : tss_host_default();
     *out = NULL;
     TSS_ASSERT(def->cookie == TSS__TRAINING_COOKIE && "tss_training_def: start from the default");
@@ -2627,6 +3020,248 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
         tss_adam_advance(m->adam);
     }
     m->step++;
+    if (out) *out = info;
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>reduced_solver (private)
+// ---------------------------------------------------------------------------------------------
+
+#define TSS__REDUCED_COOKIE 0x726564
+
+struct tss_reduced {
+    tss_host host;
+    tss_reduced_def def;
+    tss_work *work;
+    tss__n_reduced job;
+    int r, pairs, newest;  // pairs kept of the L-BFGS history
+    size_t n;
+    double *p;  // one block
+    size_t bytes;
+    double *z, *z_last, *x, *x_last, *q, *force;           // state; x_last: x_{t−1}
+    double *S, *Y, *curve, *part, *g, *g_new, *d, *z_new;  // S, Y: memory × r
+    double energy;
+    int evaluations, current;  // 1: the last evaluation was at z
+    uint64_t exits[TSS_EXITS];
+};
+
+tss_reduced_def tss_reduced_def_default(void) {
+    tss_reduced_def d;
+    memset(&d, 0, sizeof d);
+    d.h = 0.05, d.eps = 1e-5, d.ftol = 2.2e-9, d.memory = 10, d.max_line = 128,
+    d.max_iterations = 1024;
+    d.cookie = TSS__REDUCED_COOKIE;
+    return d;
+}
+
+static const char *tss__reduced_complaint(const tss_reduced_def *d) {
+    if (!d->decoder || !d->elements || !tss__n_fits(d->decoder, d->elements))
+        return "reduced solver: decoder and elements do not fit each other";
+    if (!(d->h >= 0 && d->h < 1e300)) return "reduced solver: h must be >= 0";
+    if (d->h > 0 && !d->mass) return "reduced solver: dynamics need masses";
+    if (!(d->eps >= 0) || !(d->ftol >= 0)) return "reduced solver: a tolerance is negative";
+    if (d->memory < 1 || d->memory > 64 || d->max_line < 1 || d->max_iterations < 0)
+        return "reduced solver: memory, max_line or max_iterations out of range";
+    return NULL;
+}
+
+void tss_reduced_destroy(tss_reduced *s) {
+    if (!s) return;
+    tss_host h = s->host;
+    tss_work_destroy(s->work);
+    tss_free(&h, s->p, s->bytes);
+    tss_free(&h, s, sizeof *s);
+}
+
+static void tss__reduced_carve(tss_reduced *s, tss__n_slab *b) {
+    size_t r = (size_t)s->r, n = s->n;
+    double **small[6] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new};
+    double **large[4] = {&s->x, &s->x_last, &s->q, &s->force};
+    for (int k = 0; k < 6; k++) *small[k] = tss__n_take(b, 1, r);
+    for (int k = 0; k < 4; k++) *large[k] = tss__n_take(b, 1, n);
+    s->S = tss__n_take(b, s->def.memory, r), s->Y = tss__n_take(b, s->def.memory, r);
+    s->curve = tss__n_take(b, s->def.memory, 1), s->part = tss__n_take(b, s->def.memory, 1);
+}
+
+static int tss__reduced_arrays(tss_reduced *s) {
+    tss__n_slab b = {NULL, 0, 0}, pass = {NULL, 0, 0};
+    tss__reduced_carve(s, &b);
+    if (b.want >= 1e15 || tss_work_create(&s->host, &s->work) != TSS_OK) return 0;
+    s->bytes = b.used * sizeof(double);
+    s->p = (double *)tss_alloc(&s->host, s->bytes);
+    if (!s->p) return 0;
+    tss__n_zero(s->p, b.used);
+    b.base = s->p, b.used = 0;
+    tss__reduced_carve(s, &b);
+    tss__reduced_init(&s->job, s->def.decoder, s->def.elements, TSS__CELL_REVERSE, 1, 0, NULL);
+    s->job.p.dof = NULL, s->job.p.coords = s->n;
+    tss__reduced_plan(&s->job, &pass, 0);
+    if (!tss__n_room(s->work, &pass)) return 0;
+    tss__reduced_plan(&s->job, &pass, 0);
+    return 1;
+}
+
+tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def, tss_reduced **out) {
+    tss_host h = host ? *host : tss_host_default();
+    *out = NULL;
+    TSS_ASSERT(def->cookie == TSS__REDUCED_COOKIE && "tss_reduced_def: start from the default");
+    const char *wrong = tss__reduced_complaint(def);
+    if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss_reduced *s = (tss_reduced *)tss_alloc(&h, sizeof *s);
+    if (!s) return TSS_ERROR_NO_MEMORY;
+    memset(s, 0, sizeof *s);
+    s->host = h, s->def = *def, s->r = def->decoder->inputs, s->n = (size_t)def->decoder->outputs;
+    if (!tss__reduced_arrays(s)) {
+        tss_reduced_destroy(s);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    tss_reduced_set(s, def->start ? def->start : s->z);
+    *out = s;
+    return TSS_OK;
+}
+
+// E at z; its gradient to g, f(z) is left in the job's x.
+static double tss__reduced_energy(tss_reduced *s, const double *z, double *g) {
+    tss__n_reduced *j = &s->job;
+    const tss__jetpass *p = &j->p;
+    double P, E, half = s->def.h > 0 ? 0.5 / (s->def.h * s->def.h) : 0;
+    j->z = z, j->P = &P;
+    s->evaluations++;
+    tss__jetpass_load(p, 0, z, NULL, 0), tss__jetpass_forward(p, 0), tss__jetpass_out(p, 0);
+    tss__reduced_elements(j, 0);
+    E = P;
+    for (size_t i = 0; i < s->n; i++) {
+        double gap = p->x[i] - s->q[i], m = half > 0 ? half * s->def.mass[i] : 0;
+        E += m * gap * gap - s->force[i] * p->x[i];
+        p->xbar[i] += 2 * m * gap - s->force[i];
+    }
+    tss__jetpass_in_bar(p, 0, p->xbar);
+    memcpy(g, tss__jetpass_backward(p, 0, 0), (size_t)s->r * sizeof(double));
+    return E;
+}
+
+tss_result tss_reduced_set(tss_reduced *s, const double *z) {
+    for (int i = 0; i < s->r; i++)
+        if (!isfinite(z[i])) return TSS_ERROR_BAD_STATE;
+    if (z != s->z) memcpy(s->z, z, (size_t)s->r * sizeof(double));
+    memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
+    tss__reduced_energy(s, s->z, s->g);
+    memcpy(s->x, s->job.p.x, s->n * sizeof(double));
+    memcpy(s->x_last, s->x, s->n * sizeof(double));
+    return TSS_OK;
+}
+
+void tss_reduced_set_force(tss_reduced *s, const double *force) {
+    if (force)
+        memcpy(s->force, force, s->n * sizeof(double));
+    else
+        tss__n_zero(s->force, s->n);
+}
+
+const double *tss_reduced_z(const tss_reduced *s) { return s->z; }
+const double *tss_reduced_x(const tss_reduced *s) { return s->x; }
+const uint64_t *tss_reduced_exits(const tss_reduced *s) { return s->exits; }
+
+// d = −H g by the two loops over the history (Nocedal and Wright, algorithm 7.4).
+static void tss__reduced_direction(tss_reduced *s) {
+    int r = s->r, M = s->def.memory;
+    for (int i = 0; i < r; i++) s->d[i] = -s->g[i];
+    for (int k = 0; k < s->pairs; k++) {
+        int at = (s->newest + M - k) % M;
+        s->part[at] = tss__dot_n(r, s->S + at * r, s->d) / s->curve[at];
+        for (int i = 0; i < r; i++) s->d[i] -= s->part[at] * s->Y[at * r + i];
+    }
+    double scale = 1, size = sqrt(tss__dot_n(r, s->g, s->g));
+    if (s->pairs) {
+        const double *y = s->Y + s->newest * r;
+        scale = s->curve[s->newest] / tss__dot_n(r, y, y);
+    } else if (size > 1) {
+        scale = 1 / size;  // the first step moves by 1 at most
+    }
+    for (int i = 0; i < r; i++) s->d[i] *= scale;
+    for (int k = s->pairs - 1; k >= 0; k--) {
+        int at = (s->newest + M - k) % M;
+        double b = tss__dot_n(r, s->Y + at * r, s->d) / s->curve[at];
+        for (int i = 0; i < r; i++) s->d[i] += (s->part[at] - b) * s->S[at * r + i];
+    }
+}
+
+// Keeps the pair of the step z → z_new if its curvature is safely positive.
+static void tss__reduced_learn(tss_reduced *s) {
+    int r = s->r, M = s->def.memory, at = (s->newest + 1) % M;
+    double *S = s->S + at * r, *Y = s->Y + at * r;
+    // Written over the oldest: that one is given up even if the new one is not kept.
+    if (s->pairs == M) s->pairs--;
+    for (int i = 0; i < r; i++) S[i] = s->z_new[i] - s->z[i], Y[i] = s->g_new[i] - s->g[i];
+    double sy = tss__dot_n(r, S, Y), ss = tss__dot_n(r, S, S), yy = tss__dot_n(r, Y, Y);
+    if (!(sy > 1e-12 * sqrt(ss) * sqrt(yy))) return;
+    s->curve[at] = sy, s->newest = at, s->pairs++;
+}
+
+// Backtracking (c1 = 1e-4, factor 0.8, as the paper's code) along d. 1: z_new, g_new, *E are
+// better. Where E itself is rounding, the slope decides (Hager and Zhang's approximate condition,
+// the same on a parabola).
+static int tss__reduced_line(tss_reduced *s, double *E) {
+    double t = 1, slope = tss__dot_n(s->r, s->g, s->d);
+    for (int k = 0; k < s->def.max_line; k++, t *= 0.8) {
+        for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
+        *E = tss__reduced_energy(s, s->z_new, s->g_new);
+        if (!isfinite(*E)) continue;
+        if (*E <= s->energy + 1e-4 * t * slope) return 1;
+        if (*E <= s->energy + 1e-13 * fabs(s->energy) &&
+            fabs(tss__dot_n(s->r, s->g_new, s->d)) <= -(1 - 2e-4) * slope)
+            return 1;
+    }
+    return 0;
+}
+
+static double tss__n_largest(const double *g, int r) {
+    double m = 0;
+    for (int i = 0; i < r; i++) m = fabs(g[i]) > m || isnan(g[i]) ? fabs(g[i]) : m;
+    return m;
+}
+
+static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
+    size_t wide = (size_t)s->r * sizeof(double);
+    s->pairs = 0, s->newest = 0;
+    for (*iterations = 0;; ++*iterations) {
+        double E;
+        if (tss__n_largest(s->g, s->r) <= s->def.eps) return TSS_EXIT_CONVERGED;
+        if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
+        tss__reduced_direction(s);
+        if (!(tss__dot_n(s->r, s->g, s->d) < 0)) s->pairs = 0, tss__reduced_direction(s);
+        if (!tss__reduced_line(s, &E)) {
+            s->current = 0;
+            return TSS_EXIT_LINE_SEARCH;
+        }
+        double fall = s->energy - E;
+        tss__reduced_learn(s);
+        memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
+        s->energy = E, s->current = 1;
+        if (tss__n_largest(s->g, s->r) <= s->def.eps) continue;  // counted as converged
+        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) return TSS_EXIT_SADDLE;
+    }
+}
+
+tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
+    size_t wide = (size_t)s->r * sizeof(double), long_ = s->n * sizeof(double);
+    tss_reduced_info info;
+    memset(&info, 0, sizeof info);
+    s->evaluations = 0;
+    for (size_t i = 0; i < s->n; i++) s->q[i] = 2 * s->x[i] - s->x_last[i];
+    for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
+    memcpy(s->z_last, s->z, wide), memcpy(s->x_last, s->x, long_);
+    s->energy = tss__reduced_energy(s, s->z, s->g);
+    double E = tss__reduced_energy(s, s->z_new, s->g_new);
+    s->current = E < s->energy;
+    if (s->current) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
+    info.exit = tss__reduced_minimise(s, &info.iterations);
+    if (!s->current) tss__reduced_energy(s, s->z, s->g_new);  // the last trial was not taken
+    info.energy = s->energy, info.gradient = tss__n_largest(s->g, s->r);
+    memcpy(s->x, s->job.p.x, long_);
+    info.evaluations = s->evaluations;
+    s->exits[info.exit]++;
     if (out) *out = info;
     return TSS_OK;
 }

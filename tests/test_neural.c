@@ -37,8 +37,8 @@ static double dot(const double *a, const double *b, size_t n) {
 
 typedef double value_fn(void *ctx, double t);
 
-// The best agreement of (f(h) − f(−h)) / 2h with the analytic slope over a sweep of steps, relative to
-// scale; the two must not be the same number, or one was computed from the other.
+// The best agreement of (f(h) − f(−h)) / 2h with the analytic slope over a sweep of steps, relative
+// to scale; the two must not be the same number, or one was computed from the other.
 static void check_slope(const char *name, value_fn *f, void *ctx, double slope, double scale,
                         double tol) {
     double best = INFINITY, worst_step = 0;
@@ -49,7 +49,8 @@ static void check_slope(const char *name, value_fn *f, void *ctx, double slope, 
         equal += fd == slope;
         if (error < best) best = error, worst_step = h;
     }
-    if (!(best <= tol)) fail_msg("%s: slope %g is off by %g of %g (step %g)", name, slope, best, scale, worst_step);
+    if (!(best <= tol))
+        fail_msg("%s: slope %g is off by %g of %g (step %g)", name, slope, best, scale, worst_step);
     if (equal == steps) fail_msg("%s: bit-equal to its differences", name);
 }
 
@@ -71,7 +72,8 @@ typedef struct scene {
 
 // A grid of nx × ny (× nz) boxes, two triangles or six tetrahedra each.
 static void grid(scene *s, int dim, int nx, int ny, int nz, double lx, double ly) {
-    static const int six[6][4] = {{0, 1, 3, 7}, {0, 3, 2, 7}, {0, 2, 6, 7}, {0, 6, 4, 7}, {0, 4, 5, 7}, {0, 5, 1, 7}};
+    static const int six[6][4] = {{0, 1, 3, 7}, {0, 3, 2, 7}, {0, 2, 6, 7},
+                                  {0, 6, 4, 7}, {0, 4, 5, 7}, {0, 5, 1, 7}};
     memset(s, 0, sizeof *s);
     s->dim = dim;
     if (dim == 2) nz = 0;
@@ -87,7 +89,8 @@ static void grid(scene *s, int dim, int nx, int ny, int nz, double lx, double ly
         for (int j = 0; j < ny; j++)
             for (int i = 0; i < nx; i++) {
                 int at = (k * sy + j) * sx + i, v[8];
-                for (int b = 0; b < 8; b++) v[b] = at + (b & 1) + (b >> 1 & 1) * sx + (b >> 2) * sx * sy;
+                for (int b = 0; b < 8; b++)
+                    v[b] = at + (b & 1) + (b >> 1 & 1) * sx + (b >> 2) * sx * sy;
                 if (dim == 2) {
                     int t[6] = {v[0], v[1], v[3], v[0], v[3], v[2]};
                     memcpy(s->cell + 3 * s->cells, t, sizeof t), s->cells += 2;
@@ -123,8 +126,10 @@ static tss_net *decoder_of(const scene *s, int r, tss_activation a, int matrix, 
     for (int i = 0; i < s->coords - 5; i++) index[i] = i + 5;
     d.layers = 3, d.width = width, d.activation = a, d.seed = seed;
     d.outputs = s->coords, d.out_base = s->X;
-    if (matrix) d.out_matrix = B;
-    else d.out_index = index, d.out_scale = 0.4;
+    if (matrix)
+        d.out_matrix = B;
+    else
+        d.out_index = index, d.out_scale = 0.4;
     tss_net *n;
     assert_int_equal(tss_net_create(NULL, &d, &n), TSS_OK);
     free(B);
@@ -215,14 +220,17 @@ static void plain_net(tss_net *n, const tss_net_def *d, const double *in, double
     int last = d->width[d->layers], n_out = d->outputs ? d->outputs : last;
     for (int i = 0; i < n_out; i++) out[i] = d->out_base ? d->out_base[i] : 0;
     for (int i = 0; i < last; i++) {
-        if (!d->out_matrix) out[d->out_index ? d->out_index[i] : i] += (d->outputs ? d->out_scale : 1) * h[i];
-        for (int k = 0; d->out_matrix && k < n_out; k++) out[k] += d->out_matrix[k * last + i] * h[i];
+        if (!d->out_matrix)
+            out[d->out_index ? d->out_index[i] : i] += (d->outputs ? d->out_scale : 1) * h[i];
+        for (int k = 0; d->out_matrix && k < n_out; k++)
+            out[k] += d->out_matrix[k * last + i] * h[i];
     }
 }
 
 static void test_forward(void **state) {
     (void)state;
-    double *A = randoms(13 * 9, 1), *B = randoms(21 * 11, 1), *base = randoms(21, 1), *x = randoms(37 * 13, 1);
+    double *A = randoms(13 * 9, 1), *B = randoms(21 * 11, 1), *base = randoms(21, 1),
+           *x = randoms(37 * 13, 1);
     int index[11] = {20, 3, 5, 1, 0, 9, 11, 13, 2, 17, 6}, width[4] = {9, 17, 5, 11};
     tss_work *w;
     tss_work_create(NULL, &w);
@@ -232,7 +240,8 @@ static void test_forward(void **state) {
             int short_width[2] = {9, 11};
             d.layers = layers, d.width = layers == 1 ? short_width : width, d.seed = 5;
             if (kind & 1) d.in_matrix = A, d.inputs = 13, d.in_base = kind & 2 ? base : NULL;
-            if (kind / 2 == 1) d.outputs = 21, d.out_index = index, d.out_base = base, d.out_scale = 0.7;
+            if (kind / 2 == 1)
+                d.outputs = 21, d.out_index = index, d.out_base = base, d.out_scale = 0.7;
             if (kind / 2 == 2) d.outputs = 21, d.out_matrix = B, d.out_base = base;
             tss_net *n;
             tss_net_info info;
@@ -261,7 +270,8 @@ static void test_initial(void **state) {
     tss_net_def d = tss_net_def_default();
     d.layers = 2, d.width = width, d.seed = 9;
     tss_net *a, *b, *c;
-    tss_net_create(NULL, &d, &a), tss_net_create(NULL, &d, &b), d.seed = 10, tss_net_create(NULL, &d, &c);
+    tss_net_create(NULL, &d, &a), tss_net_create(NULL, &d, &b), d.seed = 10,
+                                                                tss_net_create(NULL, &d, &c);
     double *p = tss_net_parameters(a), mean = 0, square = 0;
     size_t first = 101 * 200, all = count_of(a);
     assert_int_equal(all, 101 * 200 + 201 * 50);
@@ -296,13 +306,15 @@ static void test_backward(void **state) {
     scene_make(&s, 2, 2, 1, 0);
     for (int a = 0; a < TSS_ACTIVATIONS; a++)
         for (int kind = 0; kind < 3; kind++) {
-            tss_net *n = kind == 2 ? encoder_of(&s, 3, (tss_activation)a) : decoder_of(&s, 3, (tss_activation)a, kind, 3);
+            tss_net *n = kind == 2 ? encoder_of(&s, 3, (tss_activation)a)
+                                   : decoder_of(&s, 3, (tss_activation)a, kind, 3);
             tss_net_info info;
             tss_net_get_info(n, &info);
             int batch = 9;
             size_t P = info.parameters, N = (size_t)(batch * info.inputs);
             double *in = randoms(N, 1), *seed = randoms((size_t)(batch * info.outputs), 1);
-            double *gp = doubles(P), *gi = doubles(N), *out = doubles((size_t)(batch * info.outputs));
+            double *gp = doubles(P), *gi = doubles(N),
+                   *out = doubles((size_t)(batch * info.outputs));
             assert_int_equal(tss_net_backward(n, s.work, batch, in, seed, gp, gi), TSS_OK);
             double *p = tss_net_parameters(n);
             for (int which = 0; which < 2; which++) {
@@ -332,7 +344,8 @@ typedef struct jet_ctx {
     int k, r, outputs, order, along;
 } jet_ctx;
 
-// order 0: ⟨seed, x(z + t D_along)⟩; 1: ⟨seed, Σ_b C_along,b x_b(z + t D_along)⟩, by first-order jets.
+// order 0: ⟨seed, x(z + t D_along)⟩; 1: ⟨seed, Σ_b C_along,b x_b(z + t D_along)⟩, by first-order
+// jets.
 static double jet_value(void *ctx, double t) {
     jet_ctx *c = (jet_ctx *)ctx;
     double z[8], x[200], x1[8 * 200], s = 0;
@@ -359,14 +372,16 @@ static void test_net_jets(void **state) {
         for (int matrix = 0; matrix < 2; matrix++) {
             enum { R = 3, K = 4 };
             tss_net *n = decoder_of(&s, R, (tss_activation)a, matrix, 11);
-            double *z = randoms(R, 1), *D = randoms(K * R, 1), *C = randoms(K * K, 1), *seed = randoms(200, 1);
+            double *z = randoms(R, 1), *D = randoms(K * R, 1), *C = randoms(K * K, 1),
+                   *seed = randoms(200, 1);
             double x[200], x1[K * 200], x2[200];
             for (int i = 0; i < K; i++)
                 for (int j = 0; j < i; j++) C[i * K + j] = C[j * K + i];
             assert_int_equal(tss_net_jets(n, s.work, 1, K, z, D, C, x, x1, x2), TSS_OK);
             jet_ctx c = {n, s.work, z, D, C, seed, K, R, s.coords, 0, 0};
             for (c.along = 0; c.along < K; c.along++)
-                check_slope("y_a", jet_value, &c, dot(x1 + c.along * s.coords, seed, (size_t)s.coords), 1, 1e-8);
+                check_slope("y_a", jet_value, &c,
+                            dot(x1 + c.along * s.coords, seed, (size_t)s.coords), 1, 1e-8);
             c.order = 1;
             check_slope("y_2", jet_second, &c, dot(x2, seed, (size_t)s.coords), 1, 1e-8);
             free(z), free(D), free(C), free(seed);
@@ -377,7 +392,8 @@ static void test_net_jets(void **state) {
 
 // ---- elements -------------------------------------------------------------------------------
 
-// P as printed in peers.md §4a: λ' = λ + μ, α = 1 + μ/λ', less its rest value. Areas by cross products.
+// P as printed in peers.md §4a: λ' = λ + μ, α = 1 + μ/λ', less its rest value. Areas by cross
+// products.
 static double plain_potential(const scene *s, const double *x) {
     double P = 0, mu, la;
     int d = s->dim;
@@ -391,16 +407,19 @@ static double plain_potential(const scene *s, const double *x) {
             for (int r = 0; r < d; r++)
                 for (int c = 0; c < d; c++) e[w][r * d + c] = p[v[c + 1] * d + r] - p[v[0] * d + r];
             double *m = e[w];
-            det[w] = d == 2 ? m[0] * m[3] - m[1] * m[2]
-                            : m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) +
-                                  m[2] * (m[3] * m[7] - m[4] * m[6]);
+            det[w] = d == 2
+                         ? m[0] * m[3] - m[1] * m[2]
+                         : m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) +
+                               m[2] * (m[3] * m[7] - m[4] * m[6]);
         }
         for (int r = 0; r < d; r++)  // inverse by cofactors
             for (int c = 0; c < d; c++) {
                 const double *m = e[0];
                 int r1 = (c + 1) % d, r2 = (c + 2) % d, c1 = (r + 1) % d, c2 = (r + 2) % d;
-                inv[r * d + c] = (d == 2 ? ((r + c) % 2 ? -1 : 1) * m[r1 * 2 + c1]
-                                         : m[r1 * 3 + c1] * m[r2 * 3 + c2] - m[r1 * 3 + c2] * m[r2 * 3 + c1]) / det[0];
+                inv[r * d + c] =
+                    (d == 2 ? ((r + c) % 2 ? -1 : 1) * m[r1 * 2 + c1]
+                            : m[r1 * 3 + c1] * m[r2 * 3 + c2] - m[r1 * 3 + c2] * m[r2 * 3 + c1]) /
+                    det[0];
             }
         for (int r = 0; r < d; r++)
             for (int c = 0; c < d; c++) {
@@ -473,7 +492,8 @@ static void test_subset(void **state) {
     // Through a decoder only the touched coordinates are made: the same numbers all the same.
     for (int matrix = 0; matrix < 2; matrix++) {
         tss_net *n = decoder_of(&s, 3, TSS_SILU, matrix, 4);
-        double z[6] = {0.3, -0.2, 0.7, -1, 0.1, 0.4}, P[2], g[6], out[400], gx[400] = {0}, gz[6] = {0};
+        double z[6] = {0.3, -0.2, 0.7, -1, 0.1, 0.4}, P[2], g[6], out[400], gx[400] = {0},
+               gz[6] = {0};
         assert_int_equal(tss_reduced_potential(n, e, s.work, 2, z, P, g, NULL), TSS_OK);
         tss_net_forward(n, s.work, 2, z, out);
         for (int i = 0; i < 2; i++) {
@@ -490,8 +510,8 @@ static void test_subset(void **state) {
 enum { K3 = 3 };
 typedef struct el_ctx {
     scene *s;
-    double *x, *x1, *x2, *C;      // the state
-    double *dx, *dx1, *dx2;       // a direction in all of it
+    double *x, *x1, *x2, *C;  // the state
+    double *dx, *dx1, *dx2;   // a direction in all of it
     double alpha, beta[K3], gamma;
     int what;  // 0: P along x1[0]; 1: Σ C_ab P_b along x1[a], and P along x2; 2: the seeded sum
     int along;
@@ -503,11 +523,13 @@ static double el_value(void *ctx, double t) {
     double P, P1[K3], P2, *x = doubles(n), *x1 = doubles(n * K3), *x2 = doubles(n), out = 0;
     if (c->what < 2) {
         move(x, c->x, c->along < K3 ? c->x1 + (size_t)c->along * n : c->x2, t, n);
-        tss_elements_jets(c->s->e, K3, x, c->x1, NULL, NULL, &P, P1, NULL, 0, NULL, 0, NULL, NULL, NULL);
+        tss_elements_jets(c->s->e, K3, x, c->x1, NULL, NULL, &P, P1, NULL, 0, NULL, 0, NULL, NULL,
+                          NULL);
         out = P;
         if (c->what == 1 && c->along < K3) out = dot(c->C + c->along * K3, P1, K3);
     } else {
-        move(x, c->x, c->dx, t, n), move(x1, c->x1, c->dx1, t, n * K3), move(x2, c->x2, c->dx2, t, n);
+        move(x, c->x, c->dx, t, n), move(x1, c->x1, c->dx1, t, n * K3),
+            move(x2, c->x2, c->dx2, t, n);
         tss_elements_jets(c->s->e, K3, x, x1, c->C, x2, &P, P1, &P2, 0, NULL, 0, NULL, NULL, NULL);
         out = c->alpha * P + dot(c->beta, P1, K3) + c->gamma * P2;
     }
@@ -525,20 +547,24 @@ static double el_second(void *ctx, double t) {
 static void test_element_jets(void **state) {
     (void)state;
     for (int dim = 2; dim <= 3; dim++)
-        for (int trial = 0; trial < 4; trial++) {  // at rest, deformed, inverted in places, flattened
+        for (int trial = 0; trial < 4;
+             trial++) {  // at rest, deformed, inverted in places, flattened
             scene s;
             scene_make(&s, dim, 2, 1, 1);
             size_t n = (size_t)s.coords;
             double amount[4] = {0, 0.15, 0.8, 0}, P, P1[K3], P2;
-            double *x = doubles(n), *x1 = randoms(n * K3, 1), *x2 = randoms(n, 1), *C = randoms(K3 * K3, 1);
-            for (size_t i = 0; i < n; i++) x[i] = trial == 3 && i % (size_t)dim == 1 ? 0 : s.X[i] + amount[trial] * rnd();
+            double *x = doubles(n), *x1 = randoms(n * K3, 1), *x2 = randoms(n, 1),
+                   *C = randoms(K3 * K3, 1);
+            for (size_t i = 0; i < n; i++)
+                x[i] = trial == 3 && i % (size_t)dim == 1 ? 0 : s.X[i] + amount[trial] * rnd();
             for (int a = 0; a < K3; a++)
                 for (int b = 0; b < a; b++) C[a * K3 + b] = C[b * K3 + a];
             double *dx = randoms(n, 1), *dx1 = randoms(n * K3, 1), *dx2 = randoms(n, 1);
             double *gx = doubles(n), *gx1 = doubles(n * K3), *gx2 = doubles(n);
             el_ctx c = {&s, x, x1, x2, C, dx, dx1, dx2, 0.7, {0.3, -0.8, 1.1}, 1.3, 0, 0};
-            assert_int_equal(tss_elements_jets(s.e, K3, x, x1, C, x2, &P, P1, &P2, c.alpha, c.beta, c.gamma,
-                                               gx, gx1, gx2), TSS_OK);
+            assert_int_equal(tss_elements_jets(s.e, K3, x, x1, C, x2, &P, P1, &P2, c.alpha, c.beta,
+                                               c.gamma, gx, gx1, gx2),
+                             TSS_OK);
             for (c.along = 0; c.along < K3; c.along++)
                 check_slope("P_a", el_value, &c, P1[c.along], 1 + fabs(P1[c.along]), 1e-8);
             c.what = 1;
@@ -547,7 +573,8 @@ static void test_element_jets(void **state) {
             double slope = dot(gx, dx, n) + dot(gx1, dx1, n * K3) + dot(gx2, dx2, n);
             check_slope("reverse", el_value, &c, slope, 1 + fabs(slope), 1e-8);
             scene_free(&s);
-            free(x), free(x1), free(x2), free(C), free(dx), free(dx1), free(dx2), free(gx), free(gx1), free(gx2);
+            free(x), free(x1), free(x2), free(C), free(dx), free(dx1), free(dx2), free(gx),
+                free(gx1), free(gx2);
         }
 }
 
@@ -584,7 +611,8 @@ static void test_density(void **state) {
             double second = 0;
             for (int i = 0; i < dd; i++) {
                 second += c.A[i] * dot(C + i * dd, c.B, (size_t)dd);
-                for (int j = 0; j < dd; j++) assert_true(fabs(C[i * dd + j] - C[j * dd + i]) < 1e-14);
+                for (int j = 0; j < dd; j++)
+                    assert_true(fabs(C[i * dd + j] - C[j * dd + i]) < 1e-14);
             }
             c.what = 1;
             check_slope("psi''", density_value, &c, second, 10, 1e-9);
@@ -631,13 +659,15 @@ static void test_reduced(void **state) {
                 for (int i = 0; i < B; i++) {
                     assert_true(fabs(P[i] - P0[i]) <= 1e-13 * (1 + P[i]));
                     red_ctx c = {&s, n, z + i * R, u + i * R, v + i * R, 0, R};
-                    double slope = dot(g + i * R, u + i * R, R), second = 0, scale = 1 + fabs(slope);
+                    double slope = dot(g + i * R, u + i * R, R), second = 0,
+                           scale = 1 + fabs(slope);
                     check_slope("∇P", red_value, &c, slope, scale, 1e-8);
                     for (int k = 0; k < R; k++) {
                         const double *row = H + (i * R + k) * R;
                         second += u[i * R + k] * dot(row, v + i * R, R);
                         for (int m = 0; m < R; m++)
-                            assert_true(fabs(row[m] - H[(i * R + m) * R + k]) < 1e-11 * (1 + fabs(row[m])));
+                            assert_true(fabs(row[m] - H[(i * R + m) * R + k]) <
+                                        1e-11 * (1 + fabs(row[m])));
                         assert_true(fabs(g[i * R + k] - g0[i * R + k]) < 1e-12 * scale);
                     }
                     // The Hessian goes forward over reverse, the jet forward alone.
@@ -667,12 +697,14 @@ static double loss_run(loss_ctx *c, double weight, double *gd, double *ge, doubl
     double loss = 0;
     tss_result r = TSS_OK;
     if (c->kind == 0)
-        r = tss_loss_reconstruction(c->dec, c->enc, c->s->work, c->s->mass, c->batch, c->data, weight, &loss, gd, ge);
+        r = tss_loss_reconstruction(c->dec, c->enc, c->s->work, c->s->mass, c->batch, c->data,
+                                    weight, &loss, gd, ge);
     if (c->kind == 1)
-        r = tss_loss_unsupervised(c->dec, c->s->e, c->s->work, c->s->mass, 0.8, 0.6, 1e-3, c->batch, c->z, weight,
-                                  &loss, NULL, gd);
+        r = tss_loss_unsupervised(c->dec, c->s->e, c->s->work, c->s->mass, 0.8, 0.6, 1e-3, c->batch,
+                                  c->z, weight, &loss, NULL, gd);
     if (c->kind == 2)
-        r = tss_loss_lipschitz(c->dec, c->s->e, c->s->work, &c->lip, c->batch, c->z, c->probe, weight, &loss, gd, gz);
+        r = tss_loss_lipschitz(c->dec, c->s->e, c->s->work, &c->lip, c->batch, c->z, c->probe,
+                               weight, &loss, gd, gz);
     assert_int_equal(r, TSS_OK);
     return loss;
 }
@@ -686,7 +718,8 @@ static double loss_value(void *ctx, double t) {
 }
 
 // The gradient of the loss in an array x against differences along a random direction.
-static void check_loss(loss_ctx *c, const char *name, double *x, const double *g, size_t count, double weight) {
+static void check_loss(loss_ctx *c, const char *name, double *x, const double *g, size_t count,
+                       double weight) {
     c->x = x, c->count = count, c->dir = randoms(count, 0.5), c->x0 = doubles(count);
     memcpy(c->x0, x, count * sizeof *x);
     double slope = dot(g, c->dir, count) / weight, size = fabs(loss_run(c, 1, NULL, NULL, NULL));
@@ -700,22 +733,39 @@ static void check_losses(int dim, tss_activation a, int matrix) {
     scene_make(&s, dim, 2, 1, 1);
     tss_net *dec = decoder_of(&s, R, a, matrix, 31), *enc = encoder_of(&s, R, a);
     size_t nd = count_of(dec), ne = count_of(enc);
-    double *data = doubles((size_t)(B * s.coords)), *z = randoms(B * R, 1), *probe = randoms(2 * R * R, 1.5);
+    double *data = doubles((size_t)(B * s.coords)), *z = randoms(B * R, 1),
+           *probe = randoms(2 * R * R, 1.5);
     for (int i = 0; i < B * s.coords; i++) data[i] = s.X[i % s.coords] + 0.2 * rnd();
     for (int kind = 0; kind < 2 + 7; kind++) {
         static const int probes[9] = {0, 0, 1, 1, 1, 1, 1, 3, 3};
-        loss_ctx c = {&s, dec, enc, tss_lipschitz_def_default(), kind < 2 ? kind : 2, B, R, data, z, probe, NULL, NULL, NULL, 0};
+        loss_ctx c = {&s,
+                      dec,
+                      enc,
+                      tss_lipschitz_def_default(),
+                      kind < 2 ? kind : 2,
+                      B,
+                      R,
+                      data,
+                      z,
+                      probe,
+                      NULL,
+                      NULL,
+                      NULL,
+                      0};
         char name[80];
         if (kind >= 2) {
             c.lip.order = kind < 5 ? kind - 2 : 2;
-            c.lip.estimator = kind < 5 ? TSS_LIPSCHITZ_EXACT : kind % 2 ? TSS_LIPSCHITZ_UV : TSS_LIPSCHITZ_U;
+            c.lip.estimator = kind < 5   ? TSS_LIPSCHITZ_EXACT
+                              : kind % 2 ? TSS_LIPSCHITZ_UV
+                                         : TSS_LIPSCHITZ_U;
             c.lip.probes = probes[kind];
             if (c.lip.estimator == TSS_LIPSCHITZ_EXACT) c.probe = NULL;
         }
         if (a == TSS_ELU && kind >= 4) continue;  // σ'' jumps: the loss itself has kinks in θ
         double *gd = doubles(nd), *ge = doubles(ne), *gz = doubles(B * R), weight = 1.7;
         loss_run(&c, weight, gd, ge, kind >= 2 ? gz : NULL);
-        snprintf(name, sizeof name, "loss %d, activation %d, %dD, matrix %d", kind, (int)a, dim, matrix);
+        snprintf(name, sizeof name, "loss %d, activation %d, %dD, matrix %d", kind, (int)a, dim,
+                 matrix);
         check_loss(&c, name, tss_net_parameters(dec), gd, nd, weight);
         if (kind == 0) check_loss(&c, name, tss_net_parameters(enc), ge, ne, weight);
         if (kind >= 2) check_loss(&c, name, z, gz, B * R, weight);
@@ -723,7 +773,8 @@ static void check_losses(int dim, tss_activation a, int matrix) {
             c.lip.undivided = 1;
             memset(gz, 0, B * R * sizeof *gz), memset(gd, 0, nd * sizeof *gd);
             loss_run(&c, weight, gd, NULL, gz);
-            check_loss(&c, name, z, gz, B * R, weight), check_loss(&c, name, tss_net_parameters(dec), gd, nd, weight);
+            check_loss(&c, name, z, gz, B * R, weight),
+                check_loss(&c, name, tss_net_parameters(dec), gd, nd, weight);
         }
         free(gd), free(ge), free(gz);
     }
@@ -745,18 +796,23 @@ static void test_loss_values(void **state) {
     scene s;
     scene_make(&s, 2, 2, 1, 0);
     tss_net *dec = decoder_of(&s, R, TSS_GELU, 1, 8), *enc = encoder_of(&s, R, TSS_GELU);
-    double *z = randoms(B * R, 1), P[B], g[B * R], H[B * R * R], x[B * 200], *data = randoms((size_t)(B * s.coords), 1);
+    double *z = randoms(B * R, 1), P[B], g[B * R], H[B * R * R], x[B * 200],
+           *data = randoms((size_t)(B * s.coords), 1);
     double code[B * R], loss, parts[2], sum = 0, most[3] = {0}, lip[3] = {0}, repulsion = 0;
     tss_reduced_potential(dec, s.e, s.work, B, z, P, g, H), tss_net_forward(dec, s.work, B, z, x);
     for (int i = 0; i < B; i++)
         for (int j = 0; j < B; j++) {
             double dz = 0, df = 0, d[3] = {(P[i] - P[j]) * (P[i] - P[j]), 0, 0};
             if (i == j) continue;
-            for (int a = 0; a < R; a++) dz += pow(z[i * R + a] - z[j * R + a], 2), d[1] += pow(g[i * R + a] - g[j * R + a], 2);
+            for (int a = 0; a < R; a++)
+                dz += pow(z[i * R + a] - z[j * R + a], 2),
+                    d[1] += pow(g[i * R + a] - g[j * R + a], 2);
             for (int a = 0; a < R * R; a++) d[2] += pow(H[i * R * R + a] - H[j * R * R + a], 2);
-            for (int a = 0; a < s.coords; a++) df += s.mass[a] * pow(x[i * s.coords + a] - x[j * s.coords + a], 2);
+            for (int a = 0; a < s.coords; a++)
+                df += s.mass[a] * pow(x[i * s.coords + a] - x[j * s.coords + a], 2);
             repulsion += pow(log(sqrt(df) / (0.6 * sqrt(dz))), 2) / (B * (B - 1));
-            for (int o = 0; o < 3; o++) lip[o] += d[o] / dz / (B * (B - 1)), most[o] = fmax(most[o], sqrt(d[o] / dz));
+            for (int o = 0; o < 3; o++)
+                lip[o] += d[o] / dz / (B * (B - 1)), most[o] = fmax(most[o], sqrt(d[o] / dz));
         }
     for (int o = 0; o < 3; o++) {
         tss_lipschitz_def d = tss_lipschitz_def_default();
@@ -785,7 +841,8 @@ static void test_unbiased(void **state) {
     scene_make(&s, 2, 2, 1, 0);
     tss_net *dec = decoder_of(&s, R, TSS_SILU, 1, 8);
     size_t P = count_of(dec);
-    double *z = randoms(B * R, 1), *g = doubles(P), *dir = randoms(P, 1), exact, probe[2 * R * 2], spread[2];
+    double *z = randoms(B * R, 1), *g = doubles(P), *dir = randoms(P, 1), exact, probe[2 * R * 2],
+           spread[2];
     tss_lipschitz_def d = tss_lipschitz_def_default();
     tss_loss_lipschitz(dec, s.e, s.work, &d, B, z, NULL, 1, &exact, g, NULL);
     double slope = dot(g, dir, P);
@@ -805,8 +862,9 @@ static void test_unbiased(void **state) {
         }
         for (int q = 0; q < 2; q++) {
             double error = sqrt((v[q] - m[q] * m[q]) / N);
-            print_message("  %s, %d probe(s), %s: %g ± %g, exact %g\n", kind % 2 ? "|dH u|^2" : "(u dH v)^2",
-                          d.probes, q ? "slope" : "loss", m[q], error, want[q]);
+            print_message("  %s, %d probe(s), %s: %g ± %g, exact %g\n",
+                          kind % 2 ? "|dH u|^2" : "(u dH v)^2", d.probes, q ? "slope" : "loss",
+                          m[q], error, want[q]);
             assert_true(error > 0 && fabs(m[q] - want[q]) < 5 * error);
             if (q == 0 && kind < 2) spread[kind] = error;
         }
@@ -845,11 +903,14 @@ static void test_threads(void **state) {
         for (int est = 0; est < 3; est++) {
             tss_lipschitz_def d = tss_lipschitz_def_default();
             d.estimator = (tss_estimator)est;
-            tss_loss_lipschitz(dec, s.e, w, &d, B, z, est ? probe : NULL, 1, &lip, g + (2 + est) * (int)nd, g + 5 * nd + ne);
+            tss_loss_lipschitz(dec, s.e, w, &d, B, z, est ? probe : NULL, 1, &lip,
+                               g + (2 + est) * (int)nd, g + 5 * nd + ne);
         }
         if (first) assert_memory_equal(first, g, total * sizeof *g);
-        if (first) free(g);
-        else first = g;
+        if (first)
+            free(g);
+        else
+            first = g;
         tss_work_destroy(w);
     }
     tss_net_destroy(dec), tss_net_destroy(enc), scene_free(&s), free(z), free(data), free(first);
@@ -918,9 +979,12 @@ static void refused(const unsigned char *p, size_t size, const char *word) {
     assert_int_equal(tss_model_load(NULL, p, size, &m, NULL, 0), TSS_ERROR_FORMAT);
 }
 
-static void put64(unsigned char *p, uint64_t x) { for (int k = 0; k < 8; k++) p[k] = (unsigned char)(x >> 8 * k); }
+static void put64(unsigned char *p, uint64_t x) {
+    for (int k = 0; k < 8; k++) p[k] = (unsigned char)(x >> 8 * k);
+}
 
-static void reseal(unsigned char *p, size_t size) {  // a forger's checksum, written here from the document
+static void reseal(unsigned char *p,
+                   size_t size) {  // a forger's checksum, written here from the document
     uint64_t h = 14695981039346656037u;
     for (size_t i = 0; i < size; i++)
         if (i < 24 || i >= 32) h = (h ^ p[i]) * 1099511628211u;
@@ -946,27 +1010,38 @@ static void test_files(void **state) {
         tss_net_forward(m.decoder, s.work, 1, z, a), tss_net_forward(copy.decoder, s.work, 1, z, b);
         assert_memory_equal(a, b, (size_t)s.coords * sizeof *a);
         tss_model_free(&copy), free(q);
-        // Every byte in turn: refused. Resealed, so that the checksum is right: refused or loaded, and
-        // what loads can be run and saved (under the sanitisers in make sanitize).
+        // Every byte in turn: refused. Resealed, so that the checksum is right: refused or loaded,
+        // and what loads can be run and saved (under the sanitisers in make sanitize).
         for (size_t i = 0; i < size; i++) {
             memcpy(bad, p, size), bad[i] ^= (unsigned char)(1 + i % 255);
-            refused(bad, size, i < 8 ? "not a tss_neural file" : i < 16 ? "version" : i < 24 ? "bytes" : "checksum");
+            refused(bad, size,
+                    i < 8    ? "not a tss_neural file"
+                    : i < 16 ? "version"
+                    : i < 24 ? "bytes"
+                             : "checksum");
             if (i < 32) continue;
             reseal(bad, size);
             if (tss_model_load(NULL, bad, size, &copy, NULL, 0) != TSS_OK) continue;
             tss_net_info info;
             tss_net_get_info(copy.decoder, &info);
-            if (info.inputs <= 3 && info.outputs <= 64) tss_net_forward(copy.decoder, s.work, 1, z, b);
+            if (info.inputs <= 3 && info.outputs <= 64)
+                tss_net_forward(copy.decoder, s.work, 1, z, b);
             tss_model_free(&copy);
         }
-        for (size_t cut = 0; cut < size; cut += 1 + cut / 20) refused(p, cut, cut < 80 ? "not a" : "cut short");
+        for (size_t cut = 0; cut < size; cut += 1 + cut / 20)
+            refused(p, cut, cut < 80 ? "not a" : "cut short");
         memcpy(bad, p, size), put64(bad + 8, 7), reseal(bad, size), refused(bad, size, "version 7");
         // Absurd sizes behind a right checksum ask for no memory.
-        memcpy(bad, p, size), put64(bad + 80, 1u << 30), reseal(bad, size), refused(bad, size, "number of layers");
-        memcpy(bad, p, size), put64(bad + 80 + 56 + 8, 1 << 26), reseal(bad, size), refused(bad, size, "the decoder needs");
-        memcpy(bad, p, size), put64(bad + 80 + 56, UINT64_MAX), reseal(bad, size), refused(bad, size, "a width");
-        memcpy(bad, p, size), put64(bad + size - 8, 0x7FF8000000000000u), reseal(bad, size), refused(bad, size, "not finite");
-        memcpy(bad, p, size), memset(bad + size, 0, 8), put64(bad + 16, size + 8), reseal(bad, size + 8);
+        memcpy(bad, p, size), put64(bad + 80, 1u << 30), reseal(bad, size),
+            refused(bad, size, "number of layers");
+        memcpy(bad, p, size), put64(bad + 80 + 56 + 8, 1 << 26), reseal(bad, size),
+            refused(bad, size, "the decoder needs");
+        memcpy(bad, p, size), put64(bad + 80 + 56, UINT64_MAX), reseal(bad, size),
+            refused(bad, size, "a width");
+        memcpy(bad, p, size), put64(bad + size - 8, 0x7FF8000000000000u), reseal(bad, size),
+            refused(bad, size, "not finite");
+        memcpy(bad, p, size), memset(bad + size, 0, 8), put64(bad + 16, size + 8),
+            reseal(bad, size + 8);
         refused(bad, size + 8, "behind the end");
         free(bad), free(p), tss_model_free(&m);
     }
@@ -1003,8 +1078,10 @@ static void test_paths(void **state) {
 static tss_training_def training_of(scene *s, tss_model *m, double *frames) {
     tss_training_def d = tss_training_def_default();
     d.model = m, d.elements = s->e, d.mass = s->mass, d.batch = 6;
-    if (m->encoder) d.frames = frames, d.frame_count = 20;
-    else d.ramp = 30;
+    if (m->encoder)
+        d.frames = frames, d.frame_count = 20;
+    else
+        d.ramp = 30;
     d.lipschitz_weight = 1e-3, d.lipschitz_from = 10, d.lipschitz_batch = 4;
     d.lipschitz.estimator = TSS_LIPSCHITZ_U;
     d.adam.warmup = 5, d.adam.decay = 0.8, d.adam.decay_every = 7;
@@ -1069,8 +1146,8 @@ static void test_refusals(void **state) {
     tss_net *n;
     tss_net_def good = tss_net_def_default(), d;
     good.layers = 2, good.width = width;
-#define REFUSED(change, word)                                                            \
-    d = good, change;                                                                    \
+#define REFUSED(change, word)                                                             \
+    d = good, change;                                                                     \
     assert_int_equal(tss_net_create(&h, &d, &n), TSS_ERROR_BAD_ARGUMENT), assert_null(n); \
     assert_non_null(strstr(logged, word))
     REFUSED(d.layers = 0, "layers");
@@ -1089,20 +1166,27 @@ static void test_refusals(void **state) {
     tss_elements *e;
     tss_elements_def ed = def_of(&s);
     int flat[3] = {0, 1, 2}, far[3] = {0, 1, 99}, twist[3] = {0, 3, 1};
-    ed.cells = 1, ed.cell = flat, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_MESH);
+    ed.cells = 1, ed.cell = flat,
+    assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_MESH);
     ed.cell = far, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_MESH);
     ed.cell = twist, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_MESH);
-    ed = def_of(&s), ed.nu = 0.5, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_MATERIAL);
-    ed = def_of(&s), ed.subset = far, ed.count = 3, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_ARGUMENT);
+    ed = def_of(&s), ed.nu = 0.5,
+    assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_MATERIAL);
+    ed = def_of(&s), ed.subset = far, ed.count = 3,
+    assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_ARGUMENT);
     double minus = -1;
-    ed.count = 1, ed.weight = &minus, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_ARGUMENT);
-    ed = def_of(&s), ed.dim = 4, assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_ARGUMENT);
+    ed.count = 1, ed.weight = &minus,
+    assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_ARGUMENT);
+    ed = def_of(&s), ed.dim = 4,
+    assert_int_equal(tss_elements_create(&h, &ed, &e), TSS_ERROR_BAD_ARGUMENT);
     // Calls that do not fit each other.
     double z[8] = {0}, out[64];
     tss_net_create(NULL, &good, &n);
-    assert_int_equal(tss_reduced_potential(n, s.e, s.work, 1, z, out, NULL, NULL), TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_reduced_potential(n, s.e, s.work, 1, z, out, NULL, NULL),
+                     TSS_ERROR_BAD_ARGUMENT);
     assert_int_equal(tss_net_forward(n, s.work, 0, z, out), TSS_ERROR_BAD_ARGUMENT);
-    assert_int_equal(tss_net_jets(n, s.work, 1, 1, z, z, NULL, NULL, NULL, out), TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_net_jets(n, s.work, 1, 1, z, z, NULL, NULL, NULL, out),
+                     TSS_ERROR_BAD_ARGUMENT);
     tss_training *t;
     tss_training_def td = tss_training_def_default();
     assert_int_equal(tss_training_create(&h, &td, &t), TSS_ERROR_BAD_ARGUMENT);
@@ -1148,8 +1232,10 @@ static void test_no_memory(void **state) {
             r = tss_training_create(&h, &d, &t);
             for (int k = 0; r == TSS_OK && k < 2; k++) r = tss_training_step(t, NULL);
         }
-        if (r == TSS_OK) done = 1;
-        else failures++, assert_int_equal(r, TSS_ERROR_NO_MEMORY);
+        if (r == TSS_OK)
+            done = 1;
+        else
+            failures++, assert_int_equal(r, TSS_ERROR_NO_MEMORY);
         // After a failure in a step the next one goes on.
         allowance = 1000;
         if (t) assert_int_equal(tss_training_step(t, NULL), TSS_OK);
@@ -1160,9 +1246,238 @@ static void test_no_memory(void **state) {
     free(p), free(frames), scene_free(&s);
 }
 
+// ---- cubature -------------------------------------------------------------------------------
+
+// The relative error of a subset, from reduced gradients alone.
+static double subset_error(const scene *s, const tss_net *n, int count, const int *subset,
+                           const double *weight, int samples, const double *z) {
+    enum { R = 4 };
+    tss_elements_def d = def_of(s);
+    tss_elements *e;
+    double *a = doubles((size_t)samples * R), *b = doubles((size_t)samples * R), gap = 0;
+    d.subset = subset, d.count = count, d.weight = weight;
+    assert_int_equal(tss_elements_create(NULL, &d, &e), TSS_OK);
+    tss_reduced_potential(n, s->e, s->work, samples, z, NULL, a, NULL);
+    tss_reduced_potential(n, e, s->work, samples, z, NULL, b, NULL);
+    for (int i = 0; i < samples; i++) {
+        double size = dot(a + i * R, a + i * R, R);
+        for (int k = 0; k < R; k++) gap += pow(a[i * R + k] - b[i * R + k], 2) / size / samples;
+    }
+    free(a), free(b), tss_elements_destroy(e);
+    return sqrt(gap);
+}
+
+static void test_cubature(void **state) {
+    (void)state;
+    enum { R = 4, N = 20 };
+    for (int dim = 2; dim <= 3; dim++) {
+        scene s;
+        scene_make(&s, dim, 6, 3, 1);
+        tss_net *n = decoder_of(&s, R, TSS_SILU, 1, 3);
+        double *z = randoms(N * R, 1), *fresh = randoms(N * R, 1), last = INFINITY;
+        for (int size = 5; size <= 20; size += 5) {
+            int subset[20], count;
+            double weight[20], error;
+            tss_cubature_def d = tss_cubature_def_default();
+            d.count = size;
+            assert_int_equal(
+                tss_cubature_select(n, s.e, s.work, &d, N, z, subset, weight, &count, &error),
+                TSS_OK);
+            assert_true(count >= 1 && count <= size);
+            for (int i = 0; i < count; i++) {
+                assert_true(weight[i] > 0);
+                if (i) assert_true(subset[i] > subset[i - 1]);
+            }
+            // The reported error is the true one; more cells make it smaller; it holds at other z.
+            assert_true(fabs(subset_error(&s, n, count, subset, weight, N, z) - error) < 1e-9);
+            assert_true(error < last);
+            last = error;
+            // Least squares: no weight can be changed for the better.
+            for (int i = 0; i < count; i++)
+                for (double f = 0.98; f < 1.03; f += 0.04) {
+                    double keep = weight[i];
+                    weight[i] *= f;
+                    assert_true(subset_error(&s, n, count, subset, weight, N, z) > error);
+                    weight[i] = keep;
+                }
+            if (size < 20) continue;
+            // Against as many cells spread evenly, each for its share of the volume.
+            int even[20];
+            double share[20], other = subset_error(&s, n, count, subset, weight, N, fresh);
+            for (int i = 0; i < 20; i++) even[i] = i * s.cells / 20, share[i] = s.cells / 20.0;
+            double plain = subset_error(&s, n, 20, even, share, N, fresh);
+            print_message(
+                "cubature, %dD: 20 of %d cells, error %.3f, at other samples %.3f, evenly spread "
+                "%.3f\n",
+                dim, s.cells, error, other, plain);
+            assert_true(other < 0.6 * plain && error < 0.2);
+        }
+        // All cells may be chosen: the optimum is exact; a subset of candidates is kept to; tol
+        // stops early.
+        int all[200], count;
+        double w[200], error;
+        tss_cubature_def d = tss_cubature_def_default();
+        assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
+                         TSS_OK);
+        assert_true(error < 1e-6);
+        d.tol = 0.3;
+        assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
+                         TSS_OK);
+        assert_true(error <= 0.3 && count < 20);
+        d.tol = 0, d.candidates = 10, d.seed = 3;
+        assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
+                         TSS_OK);
+        assert_true(count <= 10 && error > 1e-3);
+        d.count = 0;
+        assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
+                         TSS_ERROR_BAD_ARGUMENT);
+        tss_net_destroy(n), scene_free(&s), free(z), free(fresh);
+    }
+}
+
+// ---- reduced solver -------------------------------------------------------------------------
+
+// z moves every free coordinate by itself: Eq. (2) is then the full-space problem.
+static tss_net *free_decoder(const scene *s, const int *index, int r) {
+    tss_net_def d = tss_net_def_default();
+    int width[2] = {r, r};
+    tss_net *n;
+    d.layers = 1, d.width = width, d.outputs = s->coords, d.out_base = s->X, d.out_index = index;
+    assert_int_equal(tss_net_create(NULL, &d, &n), TSS_OK);
+    double *p = tss_net_parameters(n);
+    for (int i = 0; i < r * (r + 1); i++) p[i] = i % (r + 1) == 0 && i < r * r;
+    return n;
+}
+
+// A cantilever under its weight, dynamic and static, against tss's Newton method with the same
+// density.
+static void test_reduced_solver(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++)
+        for (int dynamic = 0; dynamic < 2; dynamic++) {
+            scene s;
+            grid(&s, dim, 4, 1, 1, 1.5, 0.4);
+            tss_elements_def ed = def_of(&s);
+            double lame[2];
+            ed.E = 3e4, tss_lame(3e4, 0.35, &lame[0], &lame[1]);
+            tss_elements_create(NULL, &ed, &s.e), tss_work_create(NULL, &s.work);
+            int pins[8], pinned = 0, index[200], r = 0;
+            for (int i = 0; i < s.nodes; i++)
+                if (s.X[i * dim] == 0)
+                    pins[pinned++] = i;
+                else
+                    for (int a = 0; a < dim; a++) index[r++] = i * dim + a;
+            tss_world_def wd = tss_world_def_default();
+            tss_world *w;
+            wd.dim = dim, wd.dt = 0.05,
+            wd.integrator = dynamic ? TSS_IMPLICIT_EULER : TSS_QUASISTATIC;
+            wd.host.workers = 1, wd.tol = dynamic ? 1e-9 : 0, wd.tol_rel = 1e-7;
+            assert_int_equal(tss_world_create(&wd, &w), TSS_OK);
+            tss_body_def bd = tss_body_def_default();
+            bd.nodes = s.nodes, bd.X = s.X, bd.cells = s.cells, bd.cell = s.cell, bd.pins = pinned,
+            bd.pin = pins;
+            bd.material.kind = TSS_CUSTOM_MATERIAL, bd.material.density = tss_neural_density;
+            bd.material.user = lame, bd.material.has_C = 1, bd.material.E = 3e4,
+            bd.material.nu = 0.35;
+            assert_int_equal(tss_body_add(w, &bd, NULL), TSS_OK);
+            assert_int_equal(tss_world_prepare(w), TSS_OK);
+            double mass[200], force[200];
+            for (int i = 0; i < s.coords; i++) {
+                mass[i] = tss_world_masses(w)[i / dim];
+                force[i] = mass[i] * wd.gravity[i % dim];
+            }
+            tss_net *n = free_decoder(&s, index, r);
+            tss_reduced_def d = tss_reduced_def_default();
+            tss_reduced *sim;
+            d.decoder = n, d.elements = s.e, d.mass = mass, d.h = dynamic ? 0.05 : 0, d.eps = 1e-8,
+            d.ftol = 0;
+            assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+            tss_reduced_set_force(sim, force);
+            double moved = 0, gap = 0;
+            for (int step = 0; step < (dynamic ? 6 : 1); step++) {
+                tss_reduced_info info;
+                assert_int_equal(tss_world_step(w, NULL), TSS_OK);
+                assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+                assert_true(info.gradient < 1e-6);
+                for (int i = 0; i < s.coords; i++) {
+                    gap = fmax(gap, fabs(tss_reduced_x(sim)[i] - tss_world_positions(w)[i]));
+                    moved = fmax(moved, fabs(tss_reduced_x(sim)[i] - s.X[i]));
+                }
+            }
+            print_message("reduced, %dD, %s: moved %.3f m, off by %.1e m\n", dim,
+                          dynamic ? "dynamic" : "static", moved, gap);
+            assert_true(moved > 0.1 && gap < 1e-8 && gap > 0);
+            tss_reduced_destroy(sim), tss_world_destroy(w), tss_net_destroy(n), scene_free(&s);
+        }
+}
+
+// The four exits, a minimum of a nonlinear decoder, and no allocation in a step.
+static void test_reduced_exits(void **state) {
+    (void)state;
+    enum { R = 3 };
+    scene s;
+    scene_make(&s, 3, 2, 1, 1);
+    tss_net *n = decoder_of(&s, R, TSS_SILU, 1, 12);
+    double *force = randoms((size_t)s.coords, 0.1), start[R] = {1, -0.5, 0.3};
+    tss_host h = tss_host_default();
+    h.alloc = stingy_alloc, h.free = stingy_free, h.log = keep_log, h.workers = 1;
+    for (int kind = 0; kind < TSS_EXITS; kind++) {
+        tss_reduced_def d = tss_reduced_def_default();
+        tss_reduced_info info;
+        tss_reduced *sim;
+        d.decoder = n, d.elements = s.e, d.mass = s.mass, d.start = start, d.eps = 1e-7, d.ftol = 0;
+        if (kind == TSS_EXIT_SADDLE) d.eps = 0, d.ftol = 0.5;
+        if (kind == TSS_EXIT_LINE_SEARCH) d.eps = 0, d.max_line = 1;
+        if (kind == TSS_EXIT_ITERATIONS) d.max_iterations = 2;
+        int limit = 0;
+        for (allowance = 0; tss_reduced_create(&h, &d, &sim) == TSS_ERROR_NO_MEMORY;
+             allowance = ++limit)
+            assert_int_equal(held, 0);
+        assert_true(sim && limit >= 3);
+        tss_reduced_set_force(sim, force);
+        allowance = 0;
+        assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+        assert_int_equal(info.exit, kind);
+        assert_int_equal(tss_reduced_exits(sim)[kind], 1);
+        // What is reported is E and its gradient at z, whatever was tried last.
+        double x[200], z[R], E[3];
+        for (int side = -1; side <= 1; side++) {
+            for (int i = 0; i < R; i++)
+                z[i] = tss_reduced_z(sim)[i] + (i == kind % R ? 1e-3 * side : 0);
+            tss_net_forward(n, s.work, 1, z, x);
+            E[side + 1] = tss_elements_potential(s.e, x, NULL);
+            if (side == 0) assert_memory_equal(x, tss_reduced_x(sim), (size_t)s.coords * sizeof *x);
+            double x0[200];
+            tss_net_forward(n, s.work, 1, start, x0);
+            for (int i = 0; i < s.coords; i++)
+                E[side + 1] += s.mass[i] * pow(x[i] - x0[i], 2) / (2 * d.h * d.h) - force[i] * x[i];
+        }
+        assert_true(fabs(E[1] - info.energy) < 1e-9 * (1 + fabs(E[1])));
+        if (kind == TSS_EXIT_CONVERGED)
+            assert_true(info.gradient <= d.eps && E[1] < E[0] && E[1] < E[2]);
+        for (int k = 0; k < 5; k++)
+            assert_int_equal(tss_reduced_step(sim, NULL), TSS_OK);  // allowance is 0
+        tss_reduced_destroy(sim);
+        assert_int_equal(held, 0);
+    }
+    tss_reduced_def d = tss_reduced_def_default();
+    tss_reduced *sim;
+    allowance = 100, d.decoder = n, d.elements = s.e;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_ERROR_BAD_ARGUMENT);
+    assert_non_null(strstr(logged, "masses"));
+    d.h = 0, d.memory = 0;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_ERROR_BAD_ARGUMENT);
+    d.memory = 5, start[0] = NAN;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_OK);
+    assert_int_equal(tss_reduced_set(sim, start), TSS_ERROR_BAD_STATE);
+    tss_reduced_destroy(sim);
+    tss_net_destroy(n), scene_free(&s), free(force);
+}
+
 // ---- learning -------------------------------------------------------------------------------
 
-static void bend(const scene *s, double a, double b, double *x) {  // a bar bent by a and stretched by b
+static void bend(const scene *s, double a, double b,
+                 double *x) {  // a bar bent by a and stretched by b
     for (int i = 0; i < s->nodes; i++) {
         double X = s->X[i * 2] * (1 + b), Y = s->X[i * 2 + 1] - 0.15, t = a * X;
         double c = fabs(a) < 1e-9 ? X : sin(t) / a, d = fabs(a) < 1e-9 ? 0 : (1 - cos(t)) / a;
@@ -1176,7 +1491,8 @@ static int span_of(const double *frames, int count, const scene *s, int most, do
     double *rest = doubles((size_t)count * n);
     int k = 0;
     for (int f = 0; f < count; f++)
-        for (size_t i = 0; i < n; i++) rest[(size_t)f * n + i] = frames[(size_t)f * n + i] - s->X[i];
+        for (size_t i = 0; i < n; i++)
+            rest[(size_t)f * n + i] = frames[(size_t)f * n + i] - s->X[i];
     for (; k < most; k++) {
         int best = 0;
         double longest = 0;
@@ -1186,7 +1502,9 @@ static int span_of(const double *frames, int count, const scene *s, int most, do
         }
         if (longest < 1e-12) break;
         double *u = doubles(n);
-        for (size_t i = 0; i < n; i++) u[i] = rest[(size_t)best * n + i] / sqrt(longest), B[i * (size_t)most + (size_t)k] = u[i];
+        for (size_t i = 0; i < n; i++)
+            u[i] = rest[(size_t)best * n + i] / sqrt(longest),
+            B[i * (size_t)most + (size_t)k] = u[i];
         for (int f = 0; f < count; f++) {
             double c = dot(rest + (size_t)f * n, u, n);
             for (size_t i = 0; i < n; i++) rest[(size_t)f * n + i] -= c * u[i];
@@ -1205,14 +1523,17 @@ static void test_autoencoder(void **state) {
     grid(&s, 2, 8, 2, 0, 1.5, 0.3);
     tss_elements_def ed = def_of(&s);
     tss_elements_create(NULL, &ed, &s.e), tss_work_create(NULL, &s.work);
-    double *frames = doubles((size_t)(FRAMES * s.coords)), *B = doubles((size_t)(s.coords * P)), spread = 0;
+    double *frames = doubles((size_t)(FRAMES * s.coords)), *B = doubles((size_t)(s.coords * P)),
+           spread = 0;
     for (int f = 0; f < FRAMES; f++) bend(&s, 1.5 * rnd(), 0.15 * rnd(), frames + f * s.coords);
     assert_int_equal(span_of(frames, FRAMES, &s, P, B), P);
-    for (int i = 0; i < FRAMES * s.coords; i++) spread += pow(frames[i] - s.X[i % s.coords], 2) / FRAMES;
+    for (int i = 0; i < FRAMES * s.coords; i++)
+        spread += pow(frames[i] - s.X[i % s.coords], 2) / FRAMES;
     int dw[4] = {R, 24, 24, P}, ew[4] = {P, 24, 24, R};
     tss_net_def dd = tss_net_def_default(), de = dd;
     dd.layers = de.layers = 3, dd.width = dw, de.width = ew, dd.seed = 1, de.seed = 2;
-    dd.outputs = de.inputs = s.coords, dd.out_matrix = de.in_matrix = B, dd.out_base = de.in_base = s.X;
+    dd.outputs = de.inputs = s.coords, dd.out_matrix = de.in_matrix = B,
+    dd.out_base = de.in_base = s.X;
     tss_model m = {NULL, NULL, NULL, {{0}}, 0};
     assert_int_equal(tss_net_create(NULL, &dd, &m.decoder), TSS_OK);
     assert_int_equal(tss_net_create(NULL, &de, &m.encoder), TSS_OK);
@@ -1226,10 +1547,12 @@ static void test_autoencoder(void **state) {
         assert_int_equal(tss_training_create(NULL, &d, &t), TSS_OK);
         for (int k = 0; k < (phase ? 800 : 2500); k++) tss_training_step(t, &info);
         tss_training_destroy(t);
-        tss_loss_reconstruction(m.decoder, m.encoder, s.work, NULL, FRAMES, frames, 1, &loss[phase], NULL, NULL);
+        tss_loss_reconstruction(m.decoder, m.encoder, s.work, NULL, FRAMES, frames, 1, &loss[phase],
+                                NULL, NULL);
         tss_net_forward(m.encoder, s.work, FRAMES, frames, z);
         tss_lipschitz_estimate(m.decoder, s.e, s.work, 2, FRAMES, z, &lip[phase]);
-        print_message("autoencoder, phase %d: relative error %.2e, Lip %g\n", phase, sqrt(loss[phase] / spread), lip[phase]);
+        print_message("autoencoder, phase %d: relative error %.2e, Lip %g\n", phase,
+                      sqrt(loss[phase] / spread), lip[phase]);
         d.lipschitz_weight = 0.3, d.lipschitz.estimator = TSS_LIPSCHITZ_U;
     }
     assert_true(sqrt(loss[0] / spread) < 0.03);
@@ -1264,7 +1587,8 @@ static void test_unsupervised(void **state) {
     unsigned char *middle = NULL;
     size_t bytes = 0;
     for (int i = 0; i < B * R; i++) z[i] = tss_rng_normal(&rng);
-    for (int phase = 0; phase < 4; phase++) {  // the start, vanilla, more of it, Lipschitz in its place
+    for (int phase = 0; phase < 4;
+         phase++) {  // the start, vanilla, more of it, Lipschitz in its place
         tss_training *t;
         tss_lipschitz_def ld = tss_lipschitz_def_default();
         if (phase == 2) middle = saved(&m, &bytes);
@@ -1274,13 +1598,15 @@ static void test_unsupervised(void **state) {
             d.lipschitz_weight = 3, d.lipschitz.estimator = TSS_LIPSCHITZ_U;
         }
         assert_int_equal(tss_training_create(NULL, &d, &t), TSS_OK);
-        for (int k = 0; k < (phase == 0 ? 0 : phase == 1 ? 2500 : 1200); k++) tss_training_step(t, NULL);
+        for (int k = 0; k < (phase == 0 ? 0 : phase == 1 ? 2500 : 1200); k++)
+            tss_training_step(t, NULL);
         tss_training_destroy(t);
-        tss_loss_unsupervised(m.decoder, s.e, s.work, NULL, d.lambda, d.sigma, d.eps, B, z, 1, &loss[phase], parts[phase], NULL);
+        tss_loss_unsupervised(m.decoder, s.e, s.work, NULL, d.lambda, d.sigma, d.eps, B, z, 1,
+                              &loss[phase], parts[phase], NULL);
         tss_lipschitz_estimate(m.decoder, s.e, s.work, 2, B, z, &lip[phase]);
         tss_loss_lipschitz(m.decoder, s.e, s.work, &ld, B, z, NULL, 1, &mean[phase], NULL, NULL);
-        print_message("unsupervised, phase %d: L_C %.4f = %.4f + λ %.4f, L_LS %g, Lip %g\n", phase, loss[phase],
-                      parts[phase][0], parts[phase][1], mean[phase], lip[phase]);
+        print_message("unsupervised, phase %d: L_C %.4f = %.4f + λ %.4f, L_LS %g, Lip %g\n", phase,
+                      loss[phase], parts[phase][0], parts[phase][1], mean[phase], lip[phase]);
     }
     assert_true(loss[1] < 0.5 * loss[0]);
     assert_true(mean[3] < mean[2] / 10 && lip[3] < lip[2] / 3);
@@ -1298,11 +1624,13 @@ static int setup(void **state) {
 int main(void) {
 #define T(f) cmocka_unit_test_setup(f, setup)
     const struct CMUnitTest tests[] = {
-        T(test_activations), T(test_forward), T(test_initial), T(test_backward), T(test_net_jets),
-        T(test_potential), T(test_subset), T(test_element_jets), T(test_density), T(test_reduced),
-        T(test_losses), T(test_loss_values), T(test_unbiased), T(test_threads), T(test_adam),
-        T(test_files), T(test_paths), T(test_resume), T(test_refusals), T(test_no_memory),
-        T(test_autoencoder), T(test_unsupervised),
+        T(test_activations),  T(test_forward),        T(test_initial),       T(test_backward),
+        T(test_net_jets),     T(test_potential),      T(test_subset),        T(test_element_jets),
+        T(test_density),      T(test_reduced),        T(test_losses),        T(test_loss_values),
+        T(test_unbiased),     T(test_threads),        T(test_adam),          T(test_files),
+        T(test_paths),        T(test_resume),         T(test_refusals),      T(test_no_memory),
+        T(test_cubature),     T(test_reduced_solver), T(test_reduced_exits), T(test_autoencoder),
+        T(test_unsupervised),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
