@@ -3,5 +3,6 @@
 #include "tss.h"
 #include "tss_ipc.h"
 #include "tss_subspace.h"
+#include "tss_neural.h"
 #include "tss_io.h"
 #include "tss_shapes.h"

@@ -1,0 +1,3299 @@
+/* tss_neural.h: neural subspaces with Lipschitz optimisation, for tss.h, after paper B
+ * (Lyu et al. 2024, "Accelerate Neural Subspace-Based Reduced-Order Solver of Deformable Simulation
+ * by Lipschitz Optimization")
+ *
+ * What it is: a decoder f(z), a small network, maps r numbers to the positions of a mesh. It is
+ * trained so that what it can reach is what the body does (Eq. 3 or 4), and so that the elastic
+ * energy P(f(z)) has a Hessian that changes slowly with z (Eq. 9, 10): solvers then need fewer
+ * iterations. Everything runs in C, in double precision, without automatic differentiation:
+ * derivatives are jets (below), third derivatives of the energy included.
+ *
+ *     #define TSS_IMPLEMENTATION            // in one .c or .cpp file
+ *     #include "tss.h"
+ *     #include "tss_neural.h"
+ *
+ *     int width[4] = {8, 64, 64, free_coordinates};
+ *     tss_net_def nd = tss_net_def_default();
+ *     nd.layers = 3, nd.width = width, nd.outputs = coordinates;
+ *     nd.out_base = X, nd.out_index = free;
+ *     tss_model m = {0};
+ *     tss_net_create(NULL, &nd, &m.decoder);
+ *     tss_training_def td = tss_training_def_default();   // unsupervised: Eq. 4, then Eq. 10
+ *     td.model = &m, td.elements = elements, td.mass = mass, td.lipschitz_weight = 1e-3;
+ *     tss_training *t;
+ *     tss_training_create(NULL, &td, &t);
+ *     for (int k = 0; k < 100000; k++) tss_training_step(t, NULL);
+ *     tss_model_write(NULL, &m, "bar.tssn");
+ *
+ * tss_cubature_select (Eq. 11) finds few cells that stand for all of them in training; tss_reduced
+ * (Eq. 2) simulates with a trained decoder. Not here yet: projected Newton, scripted handles and
+ * contact in tss_reduced.
+ *
+ * Jets: for directions D_a, a < k, and one symmetric matrix C (k × k) a pass carries
+ *     y,   y_a = ∂_a y,   y_2 = Σ_ab C_ab ∂_a ∂_b y
+ * through the network and the elements. k = 1, C = 1 is a second directional derivative; k = 2 and
+ * C = [0 ½; ½ 0] is uᵀ∇²v; k = r, C = G is ⟨G, ∇²⟩ in r + 2 columns. One reverse pass gives the
+ * gradient of any α P + Σ β_a P_a + γ P_2 in θ and z. So the exact loss of order 2 costs O(r)
+ * columns a sample, its randomised estimators O(1).
+ *
+ * Memory: a net keeps its parameters and fixed matrices; tss_work grows to the largest batch and
+ * holds up to 8 gradients. Threads: a batch is cut into at most 8 fixed chunks, so no more than 8
+ * threads help; a net may be read by several threads, each with its own tss_work.
+ * Determinism: the same bits for any number of threads; random numbers are tss_rng's alone.
+ * Errors: as in tss.h. License: MIT (at the end). No options of its own.
+ *
+ * CONVENTIONS
+ *     Batches are rows: batch × width, row-major. θ: for each layer W (inputs × outputs, row-major:
+ *     W[i·outputs + o]), then b (outputs). y = activation(x W + b), the last layer without σ.
+ *     x: coordinates, node by node, as in tss.h. r: inputs of the decoder. Gradients are *added* to
+ *     arrays named ..._bar, other outputs are overwritten. Symbols are paper B's: z, f, g, P, L_C,
+ *     L_LS, λ, σ, M (a mass for each coordinate).
+ */
+#ifndef TSS_NEURAL_H
+#define TSS_NEURAL_H
+
+#ifndef TSS_H
+#error "include tss.h before tss_neural.h"
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+// ---------------------------------------------------------------------------------------------
+// >>random (public)
+// xoshiro256++ (Blackman and Vigna), seeded through splitmix64. The state is four numbers and goes
+// into model files.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_rng {
+    uint64_t s[4];
+} tss_rng;
+TSS_API tss_rng tss_rng_seed(uint64_t seed);
+TSS_API uint64_t tss_rng_next(tss_rng *r);
+TSS_API double tss_rng_uniform(tss_rng *r);  // in [0, 1), 53 bits
+TSS_API double tss_rng_normal(tss_rng *r);   // N(0, 1), Box and Muller; two uniforms each
+
+// ---------------------------------------------------------------------------------------------
+// >>networks (public)
+// Multi-layer perceptrons between two optional fixed maps.
+// ---------------------------------------------------------------------------------------------
+
+typedef enum tss_activation {
+    // s > 0: s, else e^s − 1. C1 only: the second derivative jumps from 1 to 0 at 0, where it is
+    // taken to be 1 (the left limit, as in JAX).
+    TSS_ELU = 0,
+    TSS_SILU,      // s / (1 + e^−s), smooth
+    TSS_SOFTPLUS,  // ln(1 + e^s), smooth
+    TSS_GELU,      // s Φ(s) with the normal distribution itself (erf), smooth
+    TSS_ACTIVATIONS
+} tss_activation;
+
+typedef struct tss_net_def {
+    int layers;        // linear layers, 1..64
+    const int *width;  // layers + 1 numbers >= 1: inputs of the MLP, hidden, outputs of the MLP
+    tss_activation activation;  // between layers; default TSS_ELU
+    uint64_t seed;              // of θ: uniform in ±1/√inputs for W and b of a layer; default 0
+    // Encoder's first map: mlp(Aᵀ(x − x0)). in_matrix A: inputs × width[0], row-major; NULL
+    // (default): the input is the MLP's. in_base x0: inputs numbers, NULL: 0.
+    int inputs;
+    const double *in_base, *in_matrix;
+    // Decoder's last map: x0 + B·mlp with out_matrix B (outputs × width[layers], row-major); or, if
+    // it is NULL, x0 + s·mlp, output i of the MLP going to coordinate out_index[i] (distinct; NULL:
+    // i). out_base x0: outputs numbers, NULL: 0. outputs 0 (default): width[layers], out_index
+    // NULL.
+    int outputs;
+    const double *out_base, *out_matrix;
+    const int *out_index;
+    double out_scale;  // s, finite; default 1. Not with out_matrix
+    int cookie;
+} tss_net_def;
+TSS_API tss_net_def tss_net_def_default(void);
+
+typedef struct tss_net tss_net;    // opaque; owns copies of everything in its def
+typedef struct tss_work tss_work;  // scratch memory, one for each thread that calls
+
+// host (NULL: the C library's memory, OpenMP's threads) is copied. Errors: BAD_ARGUMENT (host's log
+// says what), NO_MEMORY; *out is then NULL.
+TSS_API tss_result tss_net_create(const tss_host *host, const tss_net_def *def, tss_net **out);
+TSS_API void tss_net_destroy(tss_net *net);  // NULL allowed
+
+typedef struct tss_net_info {
+    int layers, inputs, outputs;  // of the whole map
+    const int *width;             // layers + 1
+    tss_activation activation;
+    size_t parameters;  // of θ
+    double out_scale;
+} tss_net_info;
+TSS_API void tss_net_get_info(const tss_net *net, tss_net_info *out);
+// θ, to read and to write; layout under CONVENTIONS. Owned by the net.
+TSS_API double *tss_net_parameters(tss_net *net);
+TSS_API void tss_net_set_scale(tss_net *net, double s);  // out_scale
+
+// Threads are the host's of tss_work. Errors: NO_MEMORY.
+TSS_API tss_result tss_work_create(const tss_host *host, tss_work **out);
+TSS_API void tss_work_destroy(tss_work *work);  // NULL allowed
+
+// out = net(in), in: batch × inputs, out: batch × outputs. Errors: BAD_ARGUMENT, NO_MEMORY. Cost:
+// 2·batch·parameters flops, and the maps.
+TSS_API tss_result tss_net_forward(const tss_net *net, tss_work *work, int batch, const double *in,
+                                   double *out);
+// The reverse pass (runs the forward pass first): with out_bar = ∂S/∂out, batch × outputs, adds
+// ∂S/∂θ to theta_bar and ∂S/∂in to in_bar (batch × inputs). Each of these may be NULL.
+TSS_API tss_result tss_net_backward(const tss_net *net, tss_work *work, int batch, const double *in,
+                                    const double *out_bar, double *theta_bar, double *in_bar);
+// Jets of a net without in_matrix: D batch × k × inputs; C batch × k × k, symmetric (NULL: x2 is
+// not asked for). Writes x (batch × outputs), x1 (batch × k × outputs), x2 (batch × outputs); NULL:
+// not wanted. k >= 0.
+TSS_API tss_result tss_net_jets(const tss_net *net, tss_work *work, int batch, int k,
+                                const double *z, const double *D, const double *C, double *x,
+                                double *x1, double *x2);
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_elements (public)
+// P(x) = Σ_e w_e vol_e Ψ(F_e) over tetrahedra or triangles of a plane (1 m deep, as in tss.h), Ψ
+// the stable Neo-Hookean density of Smith, De Goes and Kim 2018 without the logarithm:
+//     Ψ = μ/2 ‖F‖² + λ'/2 (J − α)² − rest,  λ' = λ + μ,  α = 1 + μ/λ',
+// zero with no stress at rest, linear elasticity with μ and λ for small strain, finite when
+// inverted. A polynomial in F: third derivatives are short. tss_neural_density gives a tss.h
+// material with it.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_elements_def {
+    int dim;  // 3 (default): tetrahedra; 2: triangles
+    int nodes;
+    const double *X;  // rest positions, nodes × dim, m
+    int cells;
+    const int *cell;            // cells × (dim + 1), positive volume
+    double E, nu;               // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
+    const double *mu, *lambda;  // of each cell, Pa, in place of E and nu; both or NULL
+    int count;                  // subset of cells (cubature, Eq. 11); used if subset is not NULL
+    const int *subset;          // count cells, each at most once
+    const double *weight;       // w_e >= 0 of each cell of the subset, or of each cell; NULL: 1
+    int cookie;
+} tss_elements_def;
+TSS_API tss_elements_def tss_elements_def_default(void);
+
+typedef struct tss_elements tss_elements;  // opaque, read-only: any number of threads
+// Everything is copied. Errors: BAD_ARGUMENT, BAD_MESH (volume not positive, node out of range),
+// BAD_MATERIAL, NO_MEMORY; host's log says what; *out is then NULL.
+TSS_API tss_result tss_elements_create(const tss_host *host, const tss_elements_def *def,
+                                       tss_elements **out);
+TSS_API void tss_elements_destroy(tss_elements *e);  // NULL allowed
+// P at x (nodes × dim); its gradient is added to g (nodes × dim, NULL: not wanted). Serial.
+TSS_API double tss_elements_potential(const tss_elements *e, const double *x, double *g);
+// Jets at x along x1 (k × nodes·dim) with C (k × k) and x2 (nodes·dim), both NULL: no second order.
+// Writes P, P1 (k) and P2; adds to the ..._bar arrays the gradient of alpha P + Σ beta_a P1_a +
+// gamma P2 in x, x1 and x2. Any output may be NULL; beta NULL: 0. Serial. Errors: BAD_ARGUMENT,
+// NO_MEMORY.
+TSS_API tss_result tss_elements_jets(const tss_elements *e, int k, const double *x,
+                                     const double *x1, const double *C, const double *x2, double *P,
+                                     double *P1, double *P2, double alpha, const double *beta,
+                                     double gamma, double *x_bar, double *x1_bar, double *x2_bar);
+// A tss_density; user: two doubles, mu and lambda. Set has_C = 1 in the material.
+TSS_API void tss_neural_density(void *user, int dim, int count, const int *cell, const double *F,
+                                double *psi, double *P, double *C);
+
+// ---------------------------------------------------------------------------------------------
+// >>reduced (public)
+// P(f(z)) and its derivatives in z. The decoder has no in_matrix and gives the elements'
+// coordinates.
+// ---------------------------------------------------------------------------------------------
+
+// For each of batch rows of z: P (batch), gradient (batch × r), hessian (batch × r × r, exact, the
+// curvature of f included, symmetric to rounding). NULL: not wanted. Cost: O(1) columns, with the
+// Hessian 2(r + 1). Errors: BAD_ARGUMENT, NO_MEMORY.
+TSS_API tss_result tss_reduced_potential(const tss_net *decoder, const tss_elements *e,
+                                         tss_work *work, int batch, const double *z, double *P,
+                                         double *gradient, double *hessian);
+// u ᵀ∇²_z P v of each row (z, u, v: batch × r), by polarisation of one jet.
+TSS_API tss_result tss_reduced_second(const tss_net *decoder, const tss_elements *e, tss_work *work,
+                                      int batch, const double *z, const double *u, const double *v,
+                                      double *out);
+
+// ---------------------------------------------------------------------------------------------
+// >>losses (public)
+// Values go to *loss (NULL allowed); weight times the gradient is added to the ..._bar arrays (each
+// may be NULL). Errors: BAD_ARGUMENT, NO_MEMORY.
+// ---------------------------------------------------------------------------------------------
+
+// Eq. (3): mean over the batch of ‖f(g(x)) − x‖²_M. x: batch × coordinates; mass: one for each
+// coordinate, NULL: 1. The encoder's outputs are the decoder's inputs.
+TSS_API tss_result tss_loss_reconstruction(const tss_net *decoder, const tss_net *encoder,
+                                           tss_work *work, const double *mass, int batch,
+                                           const double *x, double weight, double *loss,
+                                           double *decoder_bar, double *encoder_bar);
+
+// Eq. (4): mean P(f(z_i)) + lambda · mean over i ≠ j of ¼ ln²((‖f_i − f_j‖²_M + eps) /
+// (sigma² ‖z_i − z_j‖² + eps)), which is ln²(‖Δf‖_M / (σ‖Δz‖)) for eps = 0. sigma > 0, eps >= 0,
+// batch >= 2. parts (NULL, or 2 numbers): the mean potential; the mean repulsion without lambda.
+TSS_API tss_result tss_loss_unsupervised(const tss_net *decoder, const tss_elements *e,
+                                         tss_work *work, const double *mass, double lambda,
+                                         double sigma, double eps, int batch, const double *z,
+                                         double weight, double *loss, double *parts,
+                                         double *decoder_bar);
+
+typedef enum tss_estimator {
+    TSS_LIPSCHITZ_EXACT = 0,
+    TSS_LIPSCHITZ_UV,  // order 2: (uᵀ ΔH v)², u and v independent N(0, 1): mean ‖ΔH‖²_F
+    TSS_LIPSCHITZ_U,   // order 2: ‖ΔH u‖², u ~ N(0, 1): the same mean, far less variance
+} tss_estimator;
+
+typedef struct tss_lipschitz_def {
+    int order;                // o of Eq. (12): 0: P, 1: ∇P, 2 (default): ∇²P, Eq. (9)
+    tss_estimator estimator;  // default EXACT; the others for order 2 only
+    int probes;               // of the estimators, averaged, 1..r; default 1
+    double floor;   // ‖Δz‖² is replaced by max(‖Δz‖², floor), >= 0; default 1e-12
+    int undivided;  // 1: without the division by ‖Δz‖² (the spread of H alone); default 0
+} tss_lipschitz_def;
+TSS_API tss_lipschitz_def tss_lipschitz_def_default(void);
+
+// Eq. (9) and (12): mean over all i ≠ j of the batch of ‖∂ᵒP(z_i) − ∂ᵒP(z_j)‖² / ‖z_i − z_j‖²,
+// Frobenius norm. probe: probes × 2 × r numbers u, v (v unused by U), shared by the batch; NULL for
+// EXACT. z_bar (batch × r): the gradient in z, for samples that come from an encoder.
+TSS_API tss_result tss_loss_lipschitz(const tss_net *decoder, const tss_elements *e, tss_work *work,
+                                      const tss_lipschitz_def *def, int batch, const double *z,
+                                      const double *probe, double weight, double *loss,
+                                      double *decoder_bar, double *z_bar);
+// Eq. (7): the largest ratio over the pairs of the batch (pairs at distance 0 are left out), exact,
+// Frobenius norm. order 0, 1 or 2; batch >= 2.
+TSS_API tss_result tss_lipschitz_estimate(const tss_net *decoder, const tss_elements *e,
+                                          tss_work *work, int order, int batch, const double *z,
+                                          double *out);
+
+// ---------------------------------------------------------------------------------------------
+// >>cubature (public)
+// Which cells, with which weights, stand for all of them (Eq. 11): Σ w_e g_e(z_t) ≈ Σ g_e(z_t), g_e
+// the reduced gradient of one cell. Greedy non-negative least squares (An, Kim, James 2008, with
+// Lawson and Hanson's active set): the cell that points most along what is missing is added, all
+// weights are solved for again, cells whose weight would be negative leave.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_cubature_def {
+    int count;       // most cells, >= 1; default 300
+    int candidates;  // cells to choose from, drawn by seed; 0 (default): all. Memory: candidates ×
+                     // samples × r doubles
+    double tol;      // relative error at which to stop, >= 0; default 0
+    uint64_t seed;
+} tss_cubature_def;
+TSS_API tss_cubature_def tss_cubature_def_default(void);
+// z: samples × r, of the initial subspace; each counts alike (its equations are divided by the norm
+// of its gradient). subset and weight: room for def.count; ascending cells of e and w_e > 0, ready
+// for tss_elements_def. *count: cells chosen; *error (NULL allowed): ‖Σ w_e g_e − g‖ / ‖g‖ over the
+// samples. Cost: chosen · candidates · samples · r, and as much as memory. Errors: BAD_ARGUMENT,
+// NO_MEMORY.
+TSS_API tss_result tss_cubature_select(const tss_net *decoder, const tss_elements *e,
+                                       tss_work *work, const tss_cubature_def *def, int samples,
+                                       const double *z, int *subset, double *weight, int *count,
+                                       double *error);
+
+// ---------------------------------------------------------------------------------------------
+// >>adam (public)
+// Kingma and Ba 2015, with bias correction. Step t (from 0) uses the rate
+//     rate · decay^floor(t / decay_every) · min(1, (t + 1) / warmup).
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_adam_def {
+    double rate;           // > 0; default 1e-3
+    double beta1, beta2;   // in [0, 1); defaults 0.9, 0.999
+    double eps;            // > 0; default 1e-8
+    double decay;          // > 0; default 1
+    uint64_t decay_every;  // steps; 0 (default): no decay
+    uint64_t warmup;       // steps; default 0
+} tss_adam_def;
+TSS_API tss_adam_def tss_adam_def_default(void);
+
+typedef struct tss_adam tss_adam;  // opaque: moments, step count and def
+// Errors: BAD_ARGUMENT, NO_MEMORY.
+TSS_API tss_result tss_adam_create(const tss_host *host, const tss_adam_def *def, size_t parameters,
+                                   tss_adam **out);
+TSS_API void tss_adam_destroy(tss_adam *a);  // NULL allowed
+// Moves parameters [first, first + count) along their gradient with the rate of the current step;
+// tss_adam_advance then makes it the next. A network each: two calls, one advance.
+TSS_API void tss_adam_update(tss_adam *a, size_t first, size_t count, double *theta,
+                             const double *g);
+TSS_API void tss_adam_advance(tss_adam *a);
+TSS_API uint64_t tss_adam_steps(const tss_adam *a);
+TSS_API double tss_adam_rate(const tss_adam *a);  // of the current step
+// Changes rates between steps (a second phase); moments and steps stay, unless restart.
+TSS_API tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restart);
+
+// ---------------------------------------------------------------------------------------------
+// >>models (public)
+// What a file holds: a decoder, and what training needs to go on in the very bits of an
+// uninterrupted run. The format is documented in docs/neural.md: little-endian, magic, version,
+// size, checksum.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_model {  // start from zeros
+    tss_net *decoder;
+    tss_net *encoder;  // NULL: unsupervised
+    tss_adam *adam;    // NULL: trained
+    tss_rng rng;       // of the training samples
+    uint64_t step;     // training steps taken
+} tss_model;
+TSS_API void tss_model_free(tss_model *m);  // destroys the parts, leaves zeros
+
+// Bytes that the model takes; written to data if size suffices (data NULL: the size only; 0: size
+// too small, or no decoder).
+TSS_API size_t tss_model_save(const tss_model *m, void *data, size_t size);
+// *out is overwritten; on an error zeros, and why (NULL allowed, why_size bytes) says what is
+// wrong. Nothing is believed: sizes are checked against the bytes there are before memory is taken.
+// Errors: FORMAT, NO_MEMORY.
+TSS_API tss_result tss_model_load(const tss_host *host, const void *data, size_t size,
+                                  tss_model *out, char *why, size_t why_size);
+// The same through files; also FILE. A file is written beside the old one first, then renamed.
+TSS_API tss_result tss_model_write(const tss_host *host, const tss_model *m, const char *path);
+TSS_API tss_result tss_model_read(const tss_host *host, const char *path, tss_model *out, char *why,
+                                  size_t why_size);
+
+// ---------------------------------------------------------------------------------------------
+// >>training (public)
+// Eq. (10): L_C + λ_LS L_LS, from step lipschitz_from on. 0: joint training from the start; later:
+// vanilla first. With a given def the next step depends on the model alone (bits included): save
+// between any two steps, load, go on.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_training_def {
+    tss_model *model;              // borrowed; adam is made from the def below if it has none
+    const tss_elements *elements;  // P of Eq. (4); borrowed. Supervised: NULL allowed
+    const tss_elements *cubature;  // P of L_LS; NULL (default): elements
+    const double *mass;            // of each coordinate, borrowed; NULL: 1
+    const double *frames;  // supervised (there is an encoder): frame_count × coordinates, borrowed
+    int frame_count;
+    int batch;             // default 32
+    double lambda, sigma;  // Eq. (4), unsupervised; defaults 1, 1
+    double eps;            // of the logarithm; default 1e-8
+    uint64_t ramp;  // unsupervised: steps over which out_scale grows from 0 to 1, and sigma from 0
+                    // to itself; default 0: none
+    double lipschitz_weight;  // λ_LS; default 0: vanilla
+    uint64_t lipschitz_from;  // first step with L_LS; default 0
+    int lipschitz_batch;      // samples of L_LS, >= 2; default 16
+    tss_lipschitz_def lipschitz;
+    int through_encoder;  // supervised: L_LS also moves the encoder through z = g(x); default 1
+    tss_adam_def adam;
+    int cookie;
+} tss_training_def;
+TSS_API tss_training_def tss_training_def_default(void);
+
+typedef struct tss_training_info {
+    double loss;       // L_C of the batch
+    double parts[2];   // unsupervised: potential, repulsion
+    double lipschitz;  // L_LS of the batch (its estimate), 0 before it is on
+    double rate;
+    int skipped;  // 1: the gradient was not finite, and θ stays as it was
+} tss_training_info;
+
+typedef struct tss_training tss_training;  // opaque: scratch; the state is the model's
+// Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+TSS_API tss_result tss_training_create(const tss_host *host, const tss_training_def *def,
+                                       tss_training **out);
+TSS_API void tss_training_destroy(tss_training *t);  // NULL allowed; the model stays
+// One step of Adam; info may be NULL. Errors: NO_MEMORY.
+TSS_API tss_result tss_training_step(tss_training *t, tss_training_info *info);
+
+// ---------------------------------------------------------------------------------------------
+// >>reduced_solver (public)
+// Eq. (2) by L-BFGS with backtracking: each step finds z that minimises
+//     E(z) = ‖f(z) − q̄‖²_M / (2h²) + P(f(z)) − force·f(z),   q̄ = 2 x_t − x_{t−1},
+// or, when h = 0 (quasi-static), the same without the first term.
+// ---------------------------------------------------------------------------------------------
+
+typedef enum tss_exit {    // the paper's four (§5)
+    TSS_EXIT_CONVERGED,    // ‖∇E‖∞ <= eps
+    TSS_EXIT_SADDLE,       // E fell by less than ftol |E|
+    TSS_EXIT_LINE_SEARCH,  // max_line trials without enough decrease
+    TSS_EXIT_ITERATIONS,   // max_iterations
+    TSS_EXITS
+} tss_exit;
+
+typedef struct tss_reduced_def {
+    const tss_net *decoder;        // borrowed, as is the rest
+    const tss_elements *elements;  // all, or a cubature
+    const double *mass;            // of each coordinate, kg; required when h > 0
+    const double *start;           // r numbers; NULL: 0
+    double h;                      // s; 0: quasi-static. Default 0.05
+    double eps;                    // J per unit of z, >= 0; default 1e-5
+    double ftol;  // 0 <= ftol; default 2.2e-9 (L-BFGS-B's, which the paper's code uses); 0: never
+    int memory;   // pairs, 1..64; default 10
+    int max_line, max_iterations;  // defaults 128, 1024
+    int cookie;
+} tss_reduced_def;
+TSS_API tss_reduced_def tss_reduced_def_default(void);
+
+typedef struct tss_reduced_info {
+    tss_exit exit;
+    int iterations, evaluations;  // of E with its gradient
+    double energy, gradient;      // E and ‖∇E‖∞ at the end
+} tss_reduced_info;
+
+typedef struct tss_reduced tss_reduced;  // opaque
+// Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
+                                      tss_reduced **out);
+TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
+// One step; starts from z_t, or from 2 z_t − z_{t−1} where E is lower. Allocates nothing. info may
+// be NULL. Errors: none; how it ended is info.exit, and the state is the best that was found.
+TSS_API tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *info);
+TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);  // at rest in f(z)
+// Force on each coordinate, N, until changed; copied. NULL: none.
+TSS_API void tss_reduced_set_force(tss_reduced *s, const double *force);
+TSS_API const double *tss_reduced_z(const tss_reduced *s);  // r
+TSS_API const double *tss_reduced_x(const tss_reduced *s);  // coordinates, f(z)
+TSS_API const uint64_t *tss_reduced_exits(
+    const tss_reduced *s);  // TSS_EXITS counts since the start
+
+#ifdef __cplusplus
+}
+#endif
+#endif  // TSS_NEURAL_H
+
+#if defined(TSS_IMPLEMENTATION) && !defined(TSS_NEURAL_IMPLEMENTATION_DONE)
+#define TSS_NEURAL_IMPLEMENTATION_DONE
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if defined(__clang__)
+#pragma clang fp contract(off)
+#elif defined(__GNUC__)
+#pragma GCC push_options
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+// ---------------------------------------------------------------------------------------------
+// >>random (private)
+// ---------------------------------------------------------------------------------------------
+
+tss_rng tss_rng_seed(uint64_t seed) {
+    tss_rng r;
+    for (int k = 0; k < 4; k++) {  // splitmix64
+        uint64_t z = seed += 0x9E3779B97F4A7C15u;
+        z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9u;
+        z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
+        r.s[k] = z ^ (z >> 31);
+    }
+    return r;
+}
+
+static uint64_t tss__n_rotate(uint64_t x, int k) { return x << k | x >> (64 - k); }
+
+uint64_t tss_rng_next(tss_rng *r) {
+    uint64_t *s = r->s, out = tss__n_rotate(s[0] + s[3], 23) + s[0], t = s[1] << 17;
+    s[2] ^= s[0], s[3] ^= s[1], s[1] ^= s[2], s[0] ^= s[3], s[2] ^= t;
+    s[3] = tss__n_rotate(s[3], 45);
+    return out;
+}
+
+double tss_rng_uniform(tss_rng *r) { return (double)(tss_rng_next(r) >> 11) / 9007199254740992.0; }
+
+double tss_rng_normal(tss_rng *r) {
+    double u = 1 - tss_rng_uniform(r), v = tss_rng_uniform(r);  // u in (0, 1]
+    return sqrt(-2 * log(u)) * cos(6.28318530717958647692 * v);
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>slabs (private)
+// Scratch memory is planned twice by the same code: once to count, once to hand out.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__n_slab {
+    double *base;  // NULL: counting
+    size_t used;   // doubles
+    double want;   // the same, and cannot overflow
+} tss__n_slab;
+
+static double *tss__n_take(tss__n_slab *s, double rows, size_t width) {
+    double count = rows * (double)width + 8;
+    double *at = s->base ? s->base + s->used : NULL;
+    s->want += count;
+    if (s->want < 1e15) s->used += ((size_t)count + 7) & ~(size_t)7;
+    return at;
+}
+
+struct tss_work {
+    tss_host host;
+    double *p;
+    size_t bytes;
+};
+
+tss_result tss_work_create(const tss_host *host, tss_work **out) {
+    tss_host h = host ? *host : tss_host_default();
+    *out = NULL;
+    tss_work *w = (tss_work *)tss_alloc(&h, sizeof *w);
+    if (!w) return TSS_ERROR_NO_MEMORY;
+    w->host = h, w->p = NULL, w->bytes = 0;
+    *out = w;
+    return TSS_OK;
+}
+
+void tss_work_destroy(tss_work *w) {
+    if (!w) return;
+    tss_host h = w->host;
+    tss_free(&h, w->p, w->bytes);
+    tss_free(&h, w, sizeof *w);
+}
+
+// Makes room for what s counted and turns it to handing out. 0: no memory.
+static int tss__n_room(tss_work *w, tss__n_slab *s) {
+    if (s->want >= 1e15) return 0;
+    size_t bytes = s->used * sizeof(double);
+    if (bytes > w->bytes) {
+        tss_free(&w->host, w->p, w->bytes);
+        w->bytes = 0;
+        w->p = (double *)tss_alloc(&w->host, bytes);
+        if (!w->p) return 0;
+        w->bytes = bytes;
+    }
+    s->base = w->p, s->used = 0, s->want = 0;
+    return 1;
+}
+
+static void tss__n_zero(double *p, size_t count) {
+    for (size_t i = 0; i < count; i++) p[i] = 0;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>products (private)
+// C += A B by tiles of 4 × 8 sums held in registers; eight columns of B are copied into a panel
+// first, so that transposes and gathered rows or columns cost the same. Sums run over the inner
+// index in order: the bits do not depend on the size of the batch.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__n_view {  // element (i, j): p[(ri ? ri[i] : i)·rs + (ci ? ci[j] : j)·cs]
+    const double *p;
+    size_t rs, cs;
+    const int *ri, *ci;
+} tss__n_view;
+
+static tss__n_view tss__n_rows(const double *p, size_t width) {
+    tss__n_view v = {p, width, 1, NULL, NULL};
+    return v;
+}
+
+static tss__n_view tss__n_turned(tss__n_view a) {
+    tss__n_view v = {a.p, a.cs, a.rs, a.ci, a.ri};
+    return v;
+}
+
+static void tss__n_panel(size_t k, size_t from, size_t columns, const tss__n_view *b, double *to) {
+    for (size_t p = 0; p < k; p++) {
+        const double *row = b->p + (b->ri ? (size_t)b->ri[p] : p) * b->rs;
+        for (size_t c = 0; c < 8; c++)
+            to[8 * p + c] =
+                c < columns ? row[(b->ci ? (size_t)b->ci[from + c] : from + c) * b->cs] : 0;
+    }
+}
+
+// m <= 4 rows of A (element (i, p) at A[i·rs + p·cs]) times the panel.
+static void tss__n_tile4(size_t k, const double *A, size_t rs, size_t cs, const double *panel,
+                         double acc[4][8]) {
+    for (size_t p = 0; p < k; p++)
+        for (int i = 0; i < 4; i++) {
+            double a = A[(size_t)i * rs + p * cs];
+            for (int c = 0; c < 8; c++) acc[i][c] += a * panel[8 * p + (size_t)c];
+        }
+}
+
+static void tss__n_tile1(size_t k, const double *A, size_t cs, const double *panel, double acc[8]) {
+    for (size_t p = 0; p < k; p++)
+        for (int c = 0; c < 8; c++) acc[c] += A[p * cs] * panel[8 * p + (size_t)c];
+}
+
+// C (m × n, rows of width ldc) += A (m × k) · B (k × n); panel: 8·k doubles. A has no index lists.
+static void tss__n_product(size_t m, size_t n, size_t k, tss__n_view A, tss__n_view B, double *C,
+                           size_t ldc, double *panel) {
+    for (size_t j = 0; j < n; j += 8) {
+        size_t columns = n - j < 8 ? n - j : 8;
+        tss__n_panel(k, j, columns, &B, panel);
+        for (size_t i = 0; i < m; i += 4) {
+            size_t rows = m - i < 4 ? m - i : 4;
+            double acc[4][8] = {{0}};
+            if (rows == 4)
+                tss__n_tile4(k, A.p + i * A.rs, A.rs, A.cs, panel, acc);
+            else
+                for (size_t r = 0; r < rows; r++)
+                    tss__n_tile1(k, A.p + (i + r) * A.rs, A.cs, panel, acc[r]);
+            for (size_t r = 0; r < rows; r++)
+                for (size_t c = 0; c < columns; c++) C[(i + r) * ldc + j + c] += acc[r][c];
+        }
+    }
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>activations (private)
+// σ and its first three derivatives: the reverse pass of a second-order jet needs the third.
+// ---------------------------------------------------------------------------------------------
+
+static double tss__n_logistic(double s) {  // without overflow on either side
+    if (s >= 0) return 1 / (1 + exp(-s));
+    double e = exp(s);
+    return e / (1 + e);
+}
+
+static void tss__n_elu(double s, double d[4]) {
+    double e = s > 0 ? 0 : exp(s);
+    d[0] = s > 0 ? s : expm1(s), d[1] = s > 0 ? 1 : e, d[2] = e, d[3] = e;
+}
+
+static void tss__n_gelu(double s, double d[4]) {
+    double cdf = 0.5 * erfc(-s * 0.70710678118654752440);
+    double pdf = 0.39894228040143267794 * exp(-0.5 * s * s);
+    d[0] = s * cdf, d[1] = cdf + s * pdf, d[2] = (2 - s * s) * pdf, d[3] = (s * s - 4) * s * pdf;
+}
+
+static void tss__n_activate(tss_activation a, double s, double d[4]) {
+    if (a == TSS_ELU || a == TSS_GELU) {
+        a == TSS_ELU ? tss__n_elu(s, d) : tss__n_gelu(s, d);
+        return;
+    }
+    double p = tss__n_logistic(s), q = p * (1 - p), q1 = q * (1 - 2 * p);
+    if (a == TSS_SOFTPLUS) {
+        d[0] = (s > 0 ? s : 0) + log1p(exp(-fabs(s)));
+        d[1] = p, d[2] = q, d[3] = q1;
+    } else {
+        double q2 = q1 * (1 - 2 * p) - 2 * q * q;
+        d[0] = s * p, d[1] = p + s * q, d[2] = 2 * q + s * q1, d[3] = 3 * q1 + s * q2;
+    }
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>networks (private)
+// ---------------------------------------------------------------------------------------------
+
+#define TSS__NET_COOKIE 0x6e6574
+#define TSS__NET_LAYERS 64
+#define TSS__N_CHUNKS \
+    8  // pieces of a batch: the most threads that help, and gradients that are held
+
+enum { TSS__MAP_NONE, TSS__MAP_SCATTER, TSS__MAP_MATRIX };
+
+struct tss_net {
+    tss_host host;
+    int layers, inputs, outputs;
+    int width[TSS__NET_LAYERS + 1], widest;
+    size_t off[TSS__NET_LAYERS + 2];    // Σ widths before: where a layer lies on a tape, per row
+    size_t theta[TSS__NET_LAYERS + 1];  // first parameter of a layer; [layers]: all
+    tss_activation activation;
+    int has_in, map;
+    double scale;
+    double *p;  // one block: θ, in_base, in_matrix, out_base, out_matrix
+    size_t p_bytes;
+    double *par, *in_base, *in_matrix, *out_base, *out_matrix;
+    int *from;  // SCATTER: output of the MLP at each coordinate, −1: none
+    size_t from_bytes;
+};
+
+tss_net_def tss_net_def_default(void) {
+    tss_net_def d;
+    memset(&d, 0, sizeof d);
+    d.out_scale = 1, d.cookie = TSS__NET_COOKIE;
+    return d;
+}
+
+static tss_result tss__n_refuse(const tss_host *h, tss_result r, const char *text) {
+    tss_log(h, TSS_LOG_ERROR, "%s", text);
+    return r;
+}
+
+// What is wrong with a def; NULL: nothing.
+static const char *tss__net_complaint(const tss_net_def *d) {
+    if (d->layers < 1 || d->layers > TSS__NET_LAYERS) return "network: layers must be 1..64";
+    if (!d->width) return "network: no widths";
+    for (int l = 0; l <= d->layers; l++)
+        if (d->width[l] < 1 || d->width[l] > (1 << 26))
+            return "network: a width is outside 1..2^26";
+    if ((unsigned)d->activation >= TSS_ACTIVATIONS) return "network: unknown activation";
+    if (d->in_matrix && (d->inputs < 1 || d->inputs > (1 << 28)))
+        return "network: inputs must be 1..2^28";
+    if (!d->in_matrix && d->in_base) return "network: in_base without in_matrix";
+    int last = d->width[d->layers];
+    if (d->outputs < 0 || d->outputs > (1 << 28)) return "network: outputs must be 0..2^28";
+    if (d->outputs == 0 && (d->out_matrix || d->out_index || d->out_base))
+        return "network: an outer layer without outputs";
+    if (!isfinite(d->out_scale)) return "network: out_scale is not finite";
+    if (d->outputs == 0 || d->out_matrix) return NULL;
+    if (!d->out_index && d->outputs != last) return "network: outputs differ from the last width";
+    for (int i = 0; d->out_index && i < last; i++)
+        if (d->out_index[i] < 0 || d->out_index[i] >= d->outputs)
+            return "network: out_index out of range";
+    return NULL;
+}
+
+static void tss__net_layout(tss_net *n) {
+    n->off[0] = n->theta[0] = 0, n->widest = 1;
+    for (int l = 0; l <= n->layers; l++) {
+        n->off[l + 1] = n->off[l] + (size_t)n->width[l];
+        n->widest = n->width[l] > n->widest ? n->width[l] : n->widest;
+        if (l < n->layers)
+            n->theta[l + 1] = n->theta[l] + ((size_t)n->width[l] + 1) * (size_t)n->width[l + 1];
+    }
+}
+
+static size_t tss__net_parts(const tss_net *n, size_t part[5]) {
+    size_t in = n->has_in ? (size_t)n->inputs : 0, out = n->map ? (size_t)n->outputs : 0;
+    part[0] = n->theta[n->layers], part[1] = in, part[2] = in * (size_t)n->width[0];
+    part[3] = out, part[4] = n->map == TSS__MAP_MATRIX ? out * (size_t)n->width[n->layers] : 0;
+    return part[0] + part[1] + part[2] + part[3] + part[4];
+}
+
+// Takes memory for a net whose sizes are set. 0: none.
+static int tss__net_arrays(tss_net *n) {
+    size_t part[5], all = tss__net_parts(n, part);
+    if (n->map == TSS__MAP_SCATTER) {
+        n->from_bytes = (size_t)n->outputs * sizeof(int);
+        n->from = (int *)tss_alloc(&n->host, n->from_bytes);
+        if (!n->from) return 0;
+    }
+    if (all > (SIZE_MAX >> 5)) return 0;
+    n->p_bytes = all * sizeof(double);
+    n->p = (double *)tss_alloc(&n->host, n->p_bytes);
+    if (!n->p) return 0;
+    tss__n_zero(n->p, all);
+    n->par = n->p, n->in_base = n->par + part[0], n->in_matrix = n->in_base + part[1];
+    n->out_base = n->in_matrix + part[2], n->out_matrix = n->out_base + part[3];
+    return 1;
+}
+
+void tss_net_destroy(tss_net *n) {
+    if (!n) return;
+    tss_host h = n->host;
+    tss_free(&h, n->p, n->p_bytes);
+    tss_free(&h, n->from, n->from_bytes);
+    tss_free(&h, n, sizeof *n);
+}
+
+static void tss__net_seed(tss_net *n, uint64_t seed) {
+    tss_rng r = tss_rng_seed(seed);
+    for (int l = 0; l < n->layers; l++) {
+        double bound = 1 / sqrt((double)n->width[l]);
+        for (size_t i = n->theta[l]; i < n->theta[l + 1]; i++)
+            n->par[i] = bound * (2 * tss_rng_uniform(&r) - 1);
+    }
+}
+
+static const char *tss__net_fill(tss_net *n, const tss_net_def *d) {
+    size_t part[5], wide = sizeof(double);
+    tss__net_parts(n, part);
+    if (d->in_base) memcpy(n->in_base, d->in_base, part[1] * wide);
+    if (d->in_matrix) memcpy(n->in_matrix, d->in_matrix, part[2] * wide);
+    if (d->out_base) memcpy(n->out_base, d->out_base, part[3] * wide);
+    if (d->out_matrix) memcpy(n->out_matrix, d->out_matrix, part[4] * wide);
+    for (size_t i = part[0]; i < part[0] + part[1] + part[2] + part[3] + part[4]; i++)
+        if (!isfinite(n->p[i])) return "network: a base or matrix is not finite";
+    for (int i = 0; n->from && i < n->outputs; i++) n->from[i] = d->out_index ? -1 : i;
+    for (int i = 0; d->out_index && n->from && i < n->width[n->layers]; i++) {
+        if (n->from[d->out_index[i]] >= 0) return "network: out_index names a coordinate twice";
+        n->from[d->out_index[i]] = i;
+    }
+    return NULL;
+}
+
+tss_result tss_net_create(const tss_host *host, const tss_net_def *d, tss_net **out) {
+    tss_host h = host ? *host : tss_host_default();
+    *out = NULL;
+    TSS_ASSERT(d->cookie == TSS__NET_COOKIE && "tss_net_def: start from tss_net_def_default");
+    const char *wrong = tss__net_complaint(d);
+    if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss_net *n = (tss_net *)tss_alloc(&h, sizeof *n);
+    if (!n) return TSS_ERROR_NO_MEMORY;
+    memset(n, 0, sizeof *n);
+    n->host = h, n->layers = d->layers, n->activation = d->activation, n->scale = d->out_scale;
+    memcpy(n->width, d->width, (size_t)(d->layers + 1) * sizeof(int));
+    n->has_in = d->in_matrix != NULL;
+    n->map = d->out_matrix ? TSS__MAP_MATRIX : d->outputs ? TSS__MAP_SCATTER : TSS__MAP_NONE;
+    n->inputs = n->has_in ? d->inputs : n->width[0];
+    n->outputs = n->map ? d->outputs : n->width[n->layers];
+    tss__net_layout(n);
+    if (!tss__net_arrays(n)) {
+        tss_net_destroy(n);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    wrong = tss__net_fill(n, d);
+    if (wrong) {
+        tss_net_destroy(n);
+        return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    }
+    tss__net_seed(n, d->seed);
+    *out = n;
+    return TSS_OK;
+}
+
+void tss_net_get_info(const tss_net *n, tss_net_info *out) {
+    out->layers = n->layers, out->inputs = n->inputs, out->outputs = n->outputs;
+    out->width = n->width, out->activation = n->activation;
+    out->parameters = n->theta[n->layers], out->out_scale = n->scale;
+}
+
+double *tss_net_parameters(tss_net *n) { return n->par; }
+void tss_net_set_scale(tss_net *n, double s) { n->scale = s; }
+
+// ---------------------------------------------------------------------------------------------
+// >>passes (private)
+// A pass is a batch of jets on its way through a net. A sample has cols = 1 + k (+ 1) rows: y, the
+// y_a, y_2. Linear layers treat all rows alike (b goes to y alone). Through an activation h = σ(s):
+//     h_a = σ' s_a,    h_2 = σ'' Σ_ab C_ab s_a s_b + σ' s_2,
+// and back, with ŝ_a = Σ_b C_ab s_b:
+//     s̄_2 = σ' h̄_2,   s̄_a = σ' h̄_a + 2 σ'' ŝ_a h̄_2,
+//     s̄  = σ' h̄ + Σ_a σ'' s_a h̄_a + (σ''' Σ_a s_a ŝ_a + σ'' s_2) h̄_2.
+// The tangent of the first-order reverse pass, for Hessians: b' = σ' b, b'_a = σ' b_a + σ'' s_a b.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__jetpass {
+    const tss_net *net;
+    int batch, k, second, cols, chunks;
+    size_t coords;              // columns of x: all outputs, or those of dof
+    const int *dof;             // coordinates wanted, NULL: all
+    const double *C;            // batch × k × k, or NULL
+    double *act, *pre;          // tapes: layer l at rows·off[l]
+    double *x, *xbar;           // rows × coords
+    double *theta;              // chunks × parameters, or NULL
+    double *scratch;            // chunks × scratch_each
+    size_t most, scratch_each;  // most: rows of a chunk
+} tss__jetpass;
+
+static int tss__jetpass_sample(const tss__jetpass *p, int c) {
+    return (int)((int64_t)p->batch * c / p->chunks);
+}
+static int tss__jetpass_samples(const tss__jetpass *p, int c) {
+    return tss__jetpass_sample(p, c + 1) - tss__jetpass_sample(p, c);
+}
+static size_t tss__jetpass_row(const tss__jetpass *p, int c) {
+    return (size_t)tss__jetpass_sample(p, c) * (size_t)p->cols;
+}
+static size_t tss__jetpass_rows(const tss__jetpass *p, int c) {
+    return (size_t)tss__jetpass_samples(p, c) * (size_t)p->cols;
+}
+static double *tss__jetpass_layer(const tss__jetpass *p, double *tape, int c, int l) {
+    size_t rows = (size_t)p->batch * (size_t)p->cols;
+    return tape + rows * p->net->off[l] + tss__jetpass_row(p, c) * (size_t)p->net->width[l];
+}
+
+enum { TSS__PASS_X = 1, TSS__PASS_XBAR = 2, TSS__PASS_THETA = 4 };
+
+static tss__jetpass tss__jetpass_of(const tss_net *n, int batch, int k, const double *C,
+                                    const int *dof, int coords) {
+    tss__jetpass p;
+    memset(&p, 0, sizeof p);
+    p.net = n, p.batch = batch, p.k = k, p.second = C != NULL, p.C = C;
+    p.cols = 1 + k + p.second;
+    p.chunks = batch < TSS__N_CHUNKS ? batch : TSS__N_CHUNKS;
+    p.most = (size_t)((batch + p.chunks - 1) / p.chunks) * (size_t)p.cols;
+    p.dof = dof, p.coords = dof ? (size_t)coords : (size_t)n->outputs;
+    return p;
+}
+
+static void tss__jetpass_plan(tss__jetpass *p, tss__n_slab *s, int what) {
+    const tss_net *n = p->net;
+    double rows = (double)p->batch * p->cols;
+    size_t widest = (size_t)n->widest, longest = widest, ends = 0;
+    if (p->most > longest) longest = p->most;
+    if (n->map && p->coords > longest) longest = p->coords;
+    if (n->has_in) ends = p->most * (size_t)n->inputs;
+    if (n->has_in && (size_t)n->inputs > longest) longest = (size_t)n->inputs;
+    p->act = tss__n_take(s, rows, n->off[n->layers]);
+    p->pre = tss__n_take(s, rows, n->off[n->layers + 1]);
+    p->x = what & TSS__PASS_X ? tss__n_take(s, rows, p->coords) : NULL;
+    p->xbar = what & TSS__PASS_XBAR ? tss__n_take(s, rows, p->coords) : NULL;
+    p->theta = what & TSS__PASS_THETA ? tss__n_take(s, p->chunks, n->theta[n->layers]) : NULL;
+    // Two adjoints, ŝ, a panel, an encoder's input.
+    p->scratch_each = (2 * p->most + (size_t)p->k) * widest + 8 * longest + ends;
+    p->scratch = tss__n_take(s, p->chunks, p->scratch_each);
+}
+
+static double *tss__jetpass_scratch(const tss__jetpass *p, int c) {
+    return p->scratch + (size_t)c * p->scratch_each;
+}
+static double *tss__jetpass_hat(const tss__jetpass *p, int c) {
+    return tss__jetpass_scratch(p, c) + 2 * p->most * (size_t)p->net->widest;
+}
+static double *tss__jetpass_panel(const tss__jetpass *p, int c) {
+    return tss__jetpass_hat(p, c) + (size_t)p->k * (size_t)p->net->widest;
+}
+
+// The chunk's inputs: rows of `in`, directions D (sample s's at s·stride), 0 for the second order.
+static void tss__jetpass_load(const tss__jetpass *p, int c, const double *in, const double *D,
+                              size_t stride) {
+    const tss_net *n = p->net;
+    size_t r = (size_t)n->width[0], full = (size_t)n->inputs;
+    double *to = tss__jetpass_layer(p, p->act, c, 0), *panel = tss__jetpass_panel(p, c);
+    tss__n_zero(to, tss__jetpass_rows(p, c) * r);
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    double *moved = tss__jetpass_scratch(p, c) + p->scratch_each - (n->has_in ? p->most * full : 0);
+    for (int s = 0; s < count; s++) {
+        double *row = to + (size_t)(s * p->cols) * r;
+        const double *x = in + (size_t)(first + s) * full;
+        if (n->has_in)
+            for (size_t i = 0; i < full; i++) moved[(size_t)s * full + i] = x[i] - n->in_base[i];
+        else
+            memcpy(row, x, r * sizeof(double));
+        if (p->k)
+            memcpy(row + r, D + (size_t)(first + s) * stride, (size_t)p->k * r * sizeof(double));
+    }
+    if (n->has_in)
+        tss__n_product((size_t)count, r, full, tss__n_rows(moved, full),
+                       tss__n_rows(n->in_matrix, r), to, r, panel);
+}
+
+// hat[a] = Σ_b C_ab s_b of one sample; s: its rows, width w.
+static void tss__jetpass_hats(const tss__jetpass *p, int sample, const double *s, size_t w,
+                              double *hat) {
+    const double *C = p->C + (size_t)sample * (size_t)(p->k * p->k);
+    tss__n_zero(hat, (size_t)p->k * w);
+    for (int a = 0; a < p->k; a++)
+        for (int b = 0; b < p->k; b++) {
+            double f = C[a * p->k + b];
+            if (f == 0) continue;
+            for (size_t o = 0; o < w; o++) hat[(size_t)a * w + o] += f * s[(size_t)(b + 1) * w + o];
+        }
+}
+
+static void tss__jetpass_activate(const tss__jetpass *p, int c, int l) {
+    size_t w = (size_t)p->net->width[l], k = (size_t)p->k;
+    double *S = tss__jetpass_layer(p, p->pre, c, l), *H = tss__jetpass_layer(p, p->act, c, l);
+    double *hat = tss__jetpass_hat(p, c);
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    for (int i = 0; i < count; i++, S += (size_t)p->cols * w, H += (size_t)p->cols * w) {
+        if (p->second) tss__jetpass_hats(p, first + i, S, w, hat);
+        for (size_t o = 0; o < w; o++) {
+            double d[4], curve = 0;
+            tss__n_activate(p->net->activation, S[o], d);
+            H[o] = d[0];
+            for (size_t a = 0; a < k; a++) H[(a + 1) * w + o] = d[1] * S[(a + 1) * w + o];
+            if (!p->second) continue;
+            for (size_t a = 0; a < k; a++) curve += S[(a + 1) * w + o] * hat[a * w + o];
+            H[(k + 1) * w + o] = d[2] * curve + d[1] * S[(k + 1) * w + o];
+        }
+    }
+}
+
+static void tss__jetpass_forward(const tss__jetpass *p, int c) {
+    const tss_net *n = p->net;
+    size_t rows = tss__jetpass_rows(p, c);
+    for (int l = 0; l < n->layers; l++) {
+        size_t in = (size_t)n->width[l], out = (size_t)n->width[l + 1];
+        const double *W = n->par + n->theta[l], *b = W + in * out;
+        double *S = tss__jetpass_layer(p, p->pre, c, l + 1);
+        tss__n_zero(S, rows * out);
+        for (size_t r = 0; r < rows; r += (size_t)p->cols) memcpy(S + r * out, b, out * sizeof *b);
+        tss__n_product(rows, out, in, tss__n_rows(tss__jetpass_layer(p, p->act, c, l), in),
+                       tss__n_rows(W, out), S, out, tss__jetpass_panel(p, c));
+        if (l + 1 < n->layers) tss__jetpass_activate(p, c, l + 1);
+    }
+}
+
+// The adjoint of one sample's unit: h̄ in place to s̄. step: distance of the unit's rows.
+static void tss__unit_reverse(const tss__jetpass *p, const double d[4], const double *S,
+                              const double *hat, double *bar, size_t step) {
+    size_t k = (size_t)p->k;
+    double base = d[1] * bar[0], h2 = p->second ? bar[(k + 1) * step] : 0, curve = 0;
+    for (size_t a = 1; a <= k; a++) {
+        base += d[2] * S[a * step] * bar[a * step];
+        bar[a * step] *= d[1];
+        if (!p->second) continue;
+        curve += S[a * step] * hat[(a - 1) * step];
+        bar[a * step] += 2 * d[2] * hat[(a - 1) * step] * h2;
+    }
+    if (p->second) {
+        base += (d[3] * curve + d[2] * S[(k + 1) * step]) * h2;
+        bar[(k + 1) * step] = d[1] * h2;
+    }
+    bar[0] = base;
+}
+
+static void tss__unit_tangent(int k, const double d[4], const double *S, double *bar, size_t step) {
+    for (size_t a = 1; a <= (size_t)k; a++)
+        bar[a * step] = d[1] * bar[a * step] + d[2] * S[a * step] * bar[0];
+    bar[0] *= d[1];
+}
+
+static void tss__jetpass_deactivate(const tss__jetpass *p, int c, int l, int tangent, double *bar) {
+    size_t w = (size_t)p->net->width[l];
+    double *S = tss__jetpass_layer(p, p->pre, c, l), *hat = tss__jetpass_hat(p, c);
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    for (int i = 0; i < count; i++, S += (size_t)p->cols * w, bar += (size_t)p->cols * w) {
+        if (p->second) tss__jetpass_hats(p, first + i, S, w, hat);
+        for (size_t o = 0; o < w; o++) {
+            double d[4];
+            tss__n_activate(p->net->activation, S[o], d);
+            if (tangent)
+                tss__unit_tangent(p->k, d, S + o, bar + o, w);
+            else
+                tss__unit_reverse(p, d, S + o, hat + o, bar + o, w);
+        }
+    }
+}
+
+// W̄ and b̄ of layer l: all rows count for W, the first of each sample for b.
+static void tss__jetpass_theta(const tss__jetpass *p, int c, int l, const double *bar) {
+    const tss_net *n = p->net;
+    size_t in = (size_t)n->width[l], out = (size_t)n->width[l + 1], rows = tss__jetpass_rows(p, c);
+    double *W = p->theta + (size_t)c * n->theta[n->layers] + n->theta[l], *b = W + in * out;
+    tss__n_product(in, out, rows,
+                   tss__n_turned(tss__n_rows(tss__jetpass_layer(p, p->act, c, l), in)),
+                   tss__n_rows(bar, out), W, out, tss__jetpass_panel(p, c));
+    for (size_t r = 0; r < rows; r += (size_t)p->cols)
+        for (size_t o = 0; o < out; o++) b[o] += bar[r * out + o];
+}
+
+// From the adjoint of the MLP's output rows (in the first half of the scratch) to that of its input
+// rows, which is returned; parameters on the way if the pass has θ̄.
+static double *tss__jetpass_backward(const tss__jetpass *p, int c, int tangent) {
+    const tss_net *n = p->net;
+    size_t rows = tss__jetpass_rows(p, c);
+    double *bar = tss__jetpass_scratch(p, c), *next = bar + p->most * (size_t)n->widest;
+    if (p->theta) tss__n_zero(p->theta + (size_t)c * n->theta[n->layers], n->theta[n->layers]);
+    for (int l = n->layers - 1; l >= 0; l--) {
+        size_t in = (size_t)n->width[l], out = (size_t)n->width[l + 1];
+        if (p->theta) tss__jetpass_theta(p, c, l, bar);
+        tss__n_zero(next, rows * in);
+        tss__n_product(rows, in, out, tss__n_rows(bar, out),
+                       tss__n_turned(tss__n_rows(n->par + n->theta[l], out)), next, in,
+                       tss__jetpass_panel(p, c));
+        if (l > 0) tss__jetpass_deactivate(p, c, l, tangent, next);
+        double *swap = bar;
+        bar = next, next = swap;
+    }
+    return bar;
+}
+
+// The last map: rows of the MLP's output to rows of coordinates, x0 added to the base rows.
+static void tss__jetpass_out(const tss__jetpass *p, int c) {
+    const tss_net *n = p->net;
+    size_t rows = tss__jetpass_rows(p, c), w = (size_t)n->width[n->layers], T = p->coords;
+    const double *y = tss__jetpass_layer(p, p->pre, c, n->layers);
+    double *x = p->x + tss__jetpass_row(p, c) * T;
+    for (size_t r = 0; r < rows; r++)
+        for (size_t t = 0; t < T; t++) {
+            size_t at = p->dof ? (size_t)p->dof[t] : t;
+            int from = n->map == TSS__MAP_SCATTER ? n->from[at] : (int)at;
+            double base = n->map && r % (size_t)p->cols == 0 ? n->out_base[at] : 0;
+            if (n->map == TSS__MAP_SCATTER)
+                base += from < 0 ? 0 : n->scale * y[r * w + (size_t)from];
+            else if (n->map == TSS__MAP_NONE)
+                base = y[r * w + at];
+            x[r * T + t] = base;
+        }
+    if (n->map != TSS__MAP_MATRIX) return;
+    tss__n_view B = tss__n_rows(n->out_matrix, w);
+    B.ri = p->dof;
+    tss__n_product(rows, T, w, tss__n_rows(y, w), tss__n_turned(B), x, T, tss__jetpass_panel(p, c));
+}
+
+// The adjoint of the last map, x̄ rows to the first half of the scratch.
+static void tss__jetpass_in_bar(const tss__jetpass *p, int c, const double *xbar) {
+    const tss_net *n = p->net;
+    size_t rows = tss__jetpass_rows(p, c), w = (size_t)n->width[n->layers], T = p->coords;
+    double *bar = tss__jetpass_scratch(p, c);
+    tss__n_zero(bar, rows * w);
+    if (n->map == TSS__MAP_MATRIX) {
+        tss__n_view B = tss__n_rows(n->out_matrix, w);
+        B.ri = p->dof;
+        tss__n_product(rows, w, T, tss__n_rows(xbar, T), B, bar, w, tss__jetpass_panel(p, c));
+        return;
+    }
+    for (size_t r = 0; r < rows; r++)
+        for (size_t t = 0; t < T; t++) {
+            size_t at = p->dof ? (size_t)p->dof[t] : t;
+            int from = n->map == TSS__MAP_SCATTER ? n->from[at] : (int)at;
+            if (from >= 0) bar[r * w + (size_t)from] += (n->map ? n->scale : 1) * xbar[r * T + t];
+        }
+}
+
+static double *tss__jetpass_xbar(const tss__jetpass *p, int c) {
+    return p->xbar + tss__jetpass_row(p, c) * p->coords;
+}
+
+// theta_bar += weight · the chunks' gradients, summed in the order of the chunks.
+typedef struct tss__n_sum {
+    const tss__jetpass *p;
+    double weight, *to;
+} tss__n_sum;
+
+static void tss__n_sum_task(int block, int worker, void *arg) {
+    (void)worker;
+    const tss__n_sum *s = (const tss__n_sum *)arg;
+    size_t all = s->p->net->theta[s->p->net->layers], first = (size_t)block * 4096;
+    size_t end = first + 4096 < all ? first + 4096 : all;
+    for (size_t i = first; i < end; i++) {
+        double sum = 0;
+        for (int c = 0; c < s->p->chunks; c++) sum += s->p->theta[(size_t)c * all + i];
+        s->to[i] += s->weight * sum;
+    }
+}
+
+static void tss__jetpass_collect(const tss_host *host, const tss__jetpass *p, double weight,
+                                 double *to) {
+    tss__n_sum s = {p, weight, to};
+    size_t all = p->net->theta[p->net->layers];
+    if (to) tss_parallel(host, (int)((all + 4095) / 4096), tss__n_sum_task, &s);
+}
+
+// ---- the public passes ----------------------------------------------------------------------
+
+typedef struct tss__n_job {  // of forward, backward and jets
+    tss__jetpass p;
+    const double *in, *D, *out_bar;
+    double *out, *x1, *x2, *in_bar;
+} tss__n_job;
+
+static void tss__n_forward_task(int c, int worker, void *arg) {
+    (void)worker;
+    tss__n_job *j = (tss__n_job *)arg;
+    const tss__jetpass *p = &j->p;
+    size_t n = p->coords, k = (size_t)p->k, wide = n * sizeof(double);
+    tss__jetpass_load(p, c, j->in, j->D, k * (size_t)p->net->width[0]);
+    tss__jetpass_forward(p, c);
+    tss__jetpass_out(p, c);
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    for (int i = 0; i < count; i++) {
+        size_t s = (size_t)(first + i);
+        const double *x = p->x + s * (size_t)p->cols * n;
+        if (j->out) memcpy(j->out + s * n, x, wide);
+        if (j->x1 && k) memcpy(j->x1 + s * k * n, x + n, k * wide);
+        if (j->x2 && p->second) memcpy(j->x2 + s * n, x + (k + 1) * n, wide);
+    }
+}
+
+tss_result tss_net_jets(const tss_net *n, tss_work *w, int batch, int k, const double *z,
+                        const double *D, const double *C, double *x, double *x1, double *x2) {
+    if (batch < 1 || k < 0 || (k > 0 && !D) || (k > 0 && n->has_in) || (x2 && !C))
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_job j;
+    tss__n_slab s = {NULL, 0, 0};
+    memset(&j, 0, sizeof j);
+    j.p = tss__jetpass_of(n, batch, k, k ? C : NULL, NULL, 0);
+    tss__jetpass_plan(&j.p, &s, TSS__PASS_X);
+    if (!tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    tss__jetpass_plan(&j.p, &s, TSS__PASS_X);
+    j.in = z, j.D = D, j.out = x, j.x1 = x1, j.x2 = x2;
+    if (x2 && k == 0) tss__n_zero(x2, (size_t)batch * (size_t)n->outputs);
+    tss_parallel(&w->host, j.p.chunks, tss__n_forward_task, &j);
+    return TSS_OK;
+}
+
+tss_result tss_net_forward(const tss_net *n, tss_work *w, int batch, const double *in,
+                           double *out) {
+    return tss_net_jets(n, w, batch, 0, in, NULL, NULL, out, NULL, NULL);
+}
+
+// in_bar (samples × inputs) += the adjoint of the net's inputs from that of the MLP's.
+static void tss__jetpass_inputs(const tss__jetpass *p, int c, const double *bar, double *in_bar) {
+    const tss_net *n = p->net;
+    size_t r = (size_t)n->width[0], full = (size_t)n->inputs;
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    double *to = in_bar + (size_t)first * full;
+    if (n->has_in) {
+        tss__n_product((size_t)count, full, r, tss__n_rows(bar, r),
+                       tss__n_turned(tss__n_rows(n->in_matrix, r)), to, full,
+                       tss__jetpass_panel(p, c));
+        return;
+    }
+    for (int s = 0; s < count; s++)
+        for (size_t i = 0; i < r; i++) to[(size_t)s * r + i] += bar[(size_t)(s * p->cols) * r + i];
+}
+
+static void tss__n_backward_task(int c, int worker, void *arg) {
+    (void)worker;
+    tss__n_job *j = (tss__n_job *)arg;
+    const tss__jetpass *p = &j->p;
+    tss__jetpass_load(p, c, j->in, NULL, 0);
+    tss__jetpass_forward(p, c);
+    tss__jetpass_in_bar(p, c, j->out_bar + tss__jetpass_row(p, c) * p->coords);
+    const double *bar = tss__jetpass_backward(p, c, 0);
+    if (j->in_bar) tss__jetpass_inputs(p, c, bar, j->in_bar);
+}
+
+tss_result tss_net_backward(const tss_net *n, tss_work *w, int batch, const double *in,
+                            const double *out_bar, double *theta_bar, double *in_bar) {
+    if (batch < 1 || !out_bar) return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_job j;
+    tss__n_slab s = {NULL, 0, 0};
+    int what = theta_bar ? TSS__PASS_THETA : 0;
+    memset(&j, 0, sizeof j);
+    j.p = tss__jetpass_of(n, batch, 0, NULL, NULL, 0);
+    tss__jetpass_plan(&j.p, &s, what);
+    if (!tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    tss__jetpass_plan(&j.p, &s, what);
+    j.in = in, j.out_bar = out_bar, j.in_bar = in_bar;
+    tss_parallel(&w->host, j.p.chunks, tss__n_backward_task, &j);
+    tss__jetpass_collect(&w->host, &j.p, 1, theta_bar);
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_elements (private)
+// With G = F − I, j = J − 1, K = cof F, and II, III the second and third invariants:
+//     Ψ = μ/2 (‖G‖² − 2 II(G) − 2 III(G)) + λ'/2 j²,  j = tr G + II(G) + III(G),
+// without cancellation near rest. Where the strain δ = FᵀF − I is small, however far the cell has
+// turned,
+//     Ψ = μ/2 (j² − II(δ) − III(δ)) + λ'/2 j²,  j = (tr + II + III)(δ) / (1 + J)
+// has a rounding of μ|δ| and not of μ (it follows from J² = det(I + δ)). Derivatives:
+//     Ψ'      = μ (F − K) + λ' j K
+//     Ψ''[A]  = μ A + λ' (K:A) K + c K'[A],   c = λ' j − μ
+//     Ψ'''[A, B] = λ' ((K:A) K'[B] + (K:B) K'[A] + (K'[A]:B) K) + c K''[A, B].
+// In 3D K'[A] = F ⨯ A and K''[A, B] = A ⨯ B (the tensor cross product, ½ F ⨯ F = K); in 2D K is
+// linear.
+// ---------------------------------------------------------------------------------------------
+
+#define TSS__ELEMENTS_COOKIE 0x656c65
+
+struct tss_elements {
+    tss_host host;
+    int dim, nodes, cells;  // cells: of the subset
+    int used;               // nodes that have a cell
+    void *p;                // one block
+    size_t bytes;
+    double *Dinv, *vol, *mu, *la;  // cells × d², then w·vol, μ, λ'
+    int *cell, *local;             // cells × (d+1): nodes; the same, numbered within dof
+    int *dof;                      // used × d coordinates
+};
+
+static void tss__mat_cross(const double A[9], const double B[9], double out[9]) {
+    static const int next[3] = {1, 2, 0}, last[3] = {2, 0, 1};
+    for (int i = 0; i < 3; i++)
+        for (int I = 0; I < 3; I++) {
+            int a = 3 * next[i] + next[I], b = 3 * last[i] + last[I];
+            int c = 3 * next[i] + last[I], d = 3 * last[i] + next[I];
+            out[3 * i + I] = A[a] * B[b] - A[c] * B[d] + A[b] * B[a] - A[d] * B[c];
+        }
+}
+
+static void tss__cof2(const double A[4], double out[4]) {
+    double a = A[0], b = A[1], c = A[2], d = A[3];
+    out[0] = d, out[1] = -c, out[2] = -b, out[3] = a;
+}
+
+// K'[A] at F, and K''[A, B].
+static void tss__cof_d(int d, const double *F, const double *A, double *out) {
+    if (d == 3)
+        tss__mat_cross(F, A, out);
+    else
+        tss__cof2(A, out);
+}
+static void tss__cof_dd(int d, const double *A, const double *B, double *out) {
+    if (d == 3)
+        tss__mat_cross(A, B, out);
+    else
+        out[0] = out[1] = out[2] = out[3] = 0;
+}
+
+static double tss__dot_n(int n, const double *a, const double *b) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s += a[i] * b[i];
+    return s;
+}
+
+typedef struct tss__n_cell {  // one cell at one F
+    int d, dd;
+    double mu, la, j, c, psi;
+    double F[9], K[9], P[9];
+} tss__n_cell;
+
+// Invariants of a d × d matrix: trace, second, determinant (0 for d = 2).
+static void tss__invariants(int d, const double *A, double inv[3]) {
+    double C[9];
+    if (d == 2) {
+        inv[0] = A[0] + A[3], inv[1] = A[0] * A[3] - A[1] * A[2], inv[2] = 0;
+        return;
+    }
+    tss__mat_cross(A, A, C);
+    inv[0] = A[0] + A[4] + A[8], inv[1] = 0.5 * (C[0] + C[4] + C[8]);
+    inv[2] = tss__dot_n(9, C, A) / 6;
+}
+
+#define TSS__N_SMALL (1.0 / 64)  // ‖δ‖² up to which the form in δ is used, as in tss.h
+
+static void tss__cell_at(tss__n_cell *q, int d, double mu, double la, const double *F) {
+    double G[9], delta[9], inv[3], gap;
+    q->d = d, q->dd = d * d, q->mu = mu, q->la = la;
+    for (int i = 0; i < q->dd; i++) q->F[i] = F[i], G[i] = F[i] - (i % (d + 1) == 0);
+    tss__cof_d(d, F, F, q->K);
+    for (int i = 0; d == 3 && i < 9; i++) q->K[i] *= 0.5;
+    tss__invariants(d, G, inv);
+    q->j = inv[0] + inv[1] + inv[2], gap = tss__dot_n(q->dd, G, G) - 2 * inv[1] - 2 * inv[2];
+    for (int r = 0; r < d; r++)
+        for (int c = 0; c < d; c++) {
+            double s = 0;
+            for (int m = 0; m < d; m++) s += G[m * d + r] * G[m * d + c];
+            delta[r * d + c] = G[r * d + c] + G[c * d + r] + s;
+        }
+    if (tss__dot_n(q->dd, delta, delta) <= TSS__N_SMALL && q->j > -1) {
+        tss__invariants(d, delta, inv);
+        q->j = (inv[0] + inv[1] + inv[2]) / (2 + q->j);
+        gap = q->j * q->j - inv[1] - inv[2];
+    }
+    q->c = la * q->j - mu, q->psi = 0.5 * (mu * gap + la * q->j * q->j);
+    for (int i = 0; i < q->dd; i++) q->P[i] = mu * (F[i] - q->K[i]) + la * q->j * q->K[i];
+}
+
+// out += Ψ''[A].
+static void tss__cell_dd(const tss__n_cell *q, const double *A, double *out) {
+    double D[9], s = q->la * tss__dot_n(q->dd, q->K, A);
+    tss__cof_d(q->d, q->F, A, D);
+    for (int i = 0; i < q->dd; i++) out[i] += q->mu * A[i] + s * q->K[i] + q->c * D[i];
+}
+
+// out += w Ψ'''[A, B].
+static void tss__cell_ddd(const tss__n_cell *q, double w, const double *A, const double *B,
+                          double *out) {
+    double a = tss__dot_n(q->dd, q->K, A), b = tss__dot_n(q->dd, q->K, B), mix[9], D[9], E[9];
+    for (int i = 0; i < q->dd; i++) mix[i] = a * B[i] + b * A[i];
+    tss__cof_d(q->d, q->F, mix, D);  // K' is linear: both terms at once
+    tss__cof_d(q->d, q->F, A, mix);
+    double ab = tss__dot_n(q->dd, mix, B);
+    tss__cof_dd(q->d, A, B, E);
+    for (int i = 0; i < q->dd; i++) out[i] += w * (q->la * (D[i] + ab * q->K[i]) + q->c * E[i]);
+}
+
+void tss_neural_density(void *user, int dim, int count, const int *cell, const double *F,
+                        double *psi, double *P, double *C) {
+    const double *lame = (const double *)user;
+    int dd = dim * dim;
+    (void)cell;
+    for (int k = 0; k < count; k++) {
+        tss__n_cell q;
+        tss__cell_at(&q, dim, lame[0], lame[1] + lame[0], F + k * dd);
+        if (psi) psi[k] = q.psi;
+        if (P) memcpy(P + k * dd, q.P, (size_t)dd * sizeof(double));
+        for (int a = 0; C && a < dd; a++) {
+            double A[9] = {0}, *row = C + (k * dd + a) * dd;
+            A[a] = 1;
+            tss__n_zero(row, (size_t)dd);
+            tss__cell_dd(&q, A, row);
+        }
+    }
+}
+
+tss_elements_def tss_elements_def_default(void) {
+    tss_elements_def d;
+    memset(&d, 0, sizeof d);
+    d.dim = 3, d.E = 1e5, d.nu = 0.4, d.cookie = TSS__ELEMENTS_COOKIE;
+    return d;
+}
+
+static const char *tss__elements_complaint(const tss_elements_def *d, tss_result *r) {
+    *r = TSS_ERROR_BAD_ARGUMENT;
+    int count = d->subset ? d->count : d->cells;
+    if (d->dim != 2 && d->dim != 3) return "elements: dim must be 2 or 3";
+    if (d->nodes < 1 || d->nodes > (1 << 28) || d->cells < 1 || d->cells > (1 << 28) || count < 1 ||
+        count > d->cells)
+        return "elements: nodes, cells and the subset must not be empty";
+    if (!d->X || !d->cell || !d->mu != !d->lambda)
+        return "elements: X, cell or one of mu, lambda missing";
+    for (int i = 0; d->subset && i < count; i++)
+        if (d->subset[i] < 0 || d->subset[i] >= d->cells) return "elements: subset out of range";
+    for (int i = 0; d->weight && i < count; i++)
+        if (!(d->weight[i] >= 0 && d->weight[i] < 1e300))
+            return "elements: a weight is negative or not finite";
+    *r = TSS_ERROR_BAD_MATERIAL;
+    if (!d->mu && !(d->E > 0 && d->E < 1e300 && d->nu > -1 && d->nu < 0.5))
+        return "elements: E or nu out of range";
+    for (int i = 0; d->mu && i < d->cells; i++)
+        if (!(d->mu[i] > 0 && d->mu[i] < 1e300 && d->lambda[i] > -d->mu[i] && d->lambda[i] < 1e300))
+            return "elements: mu must be > 0 and lambda > −mu";
+    *r = TSS_ERROR_BAD_MESH;
+    for (int i = 0; i < d->cells * (d->dim + 1); i++)
+        if (d->cell[i] < 0 || d->cell[i] >= d->nodes)
+            return "elements: a cell names a node out of range";
+    for (int i = 0; i < d->nodes * d->dim; i++)
+        if (!isfinite(d->X[i])) return "elements: a rest position is not finite";
+    return NULL;
+}
+
+// D⁻¹ of the edges of a cell and its volume; <= 0: inverted or flat.
+static double tss__cell_rest(int d, const double *X, const int *v, double *Dinv) {
+    double D[9], K[9], det;
+    for (int r = 0; r < d; r++)
+        for (int m = 0; m < d; m++) D[r * d + m] = X[v[m + 1] * d + r] - X[v[0] * d + r];
+    if (d == 3) {
+        tss__mat_cross(D, D, K);
+        for (int i = 0; i < 9; i++) K[i] *= 0.5;
+    } else {
+        tss__cof2(D, K);
+    }
+    det = D[0] * K[0] + D[1] * K[1] + (d == 3 ? D[2] * K[2] : 0);
+    for (int r = 0; r < d; r++)
+        for (int m = 0; m < d; m++) Dinv[m * d + r] = K[r * d + m] / det;
+    return det / (d == 3 ? 6 : 2);
+}
+
+static tss_result tss__elements_fill(tss_elements *e, const tss_elements_def *d, int *number) {
+    int dim = e->dim, v = dim + 1;
+    for (int i = 0; i < d->nodes; i++) number[i] = -1;
+    for (int k = 0; k < e->cells; k++) {
+        int at = d->subset ? d->subset[k] : k;
+        double mu, la, vol = tss__cell_rest(dim, d->X, d->cell + at * v, e->Dinv + k * dim * dim);
+        if (!(vol > 0 && vol < 1e300)) return TSS_ERROR_BAD_MESH;
+        tss_lame(d->E, d->nu, &mu, &la);
+        if (d->mu) mu = d->mu[at], la = d->lambda[at];
+        e->vol[k] = vol * (d->weight ? d->weight[k] : 1), e->mu[k] = mu, e->la[k] = la + mu;
+        for (int a = 0; a < v; a++) number[e->cell[k * v + a] = d->cell[at * v + a]] = 0;
+    }
+    for (int i = 0; i < d->nodes; i++) {  // in the order of the nodes
+        if (number[i] < 0) continue;
+        for (int a = 0; a < dim; a++) e->dof[e->used * dim + a] = i * dim + a;
+        number[i] = e->used++;
+    }
+    for (int i = 0; i < e->cells * v; i++) e->local[i] = number[e->cell[i]];
+    return TSS_OK;
+}
+
+void tss_elements_destroy(tss_elements *e) {
+    if (!e) return;
+    tss_host h = e->host;
+    tss_free(&h, e->p, e->bytes);
+    tss_free(&h, e, sizeof *e);
+}
+
+static tss_elements *tss__elements_alloc(const tss_host *h, const tss_elements_def *d) {
+    tss_elements *e = (tss_elements *)tss_alloc(h, sizeof *e);
+    if (!e) return NULL;
+    memset(e, 0, sizeof *e);
+    e->host = *h, e->dim = d->dim, e->nodes = d->nodes, e->cells = d->subset ? d->count : d->cells;
+    size_t m = (size_t)e->cells, dim = (size_t)d->dim, most = (size_t)d->nodes;
+    if (m * (dim + 1) < most) most = m * (dim + 1);  // nodes that can be used
+    e->bytes =
+        m * (dim * dim + 3) * sizeof(double) + (2 * m * (dim + 1) + most * dim) * sizeof(int);
+    e->p = tss_alloc(h, e->bytes);
+    if (!e->p) {
+        tss_elements_destroy(e);
+        return NULL;
+    }
+    e->Dinv = (double *)e->p, e->vol = e->Dinv + m * dim * dim, e->mu = e->vol + m,
+    e->la = e->mu + m;
+    e->cell = (int *)(void *)(e->la + m), e->local = e->cell + m * (dim + 1);
+    e->dof = e->local + m * (dim + 1);
+    return e;
+}
+
+tss_result tss_elements_create(const tss_host *host, const tss_elements_def *d,
+                               tss_elements **out) {
+    tss_host h = host ? *host : tss_host_default();
+    tss_result r;
+    *out = NULL;
+    TSS_ASSERT(d->cookie == TSS__ELEMENTS_COOKIE && "tss_elements_def: start from the default");
+    const char *wrong = tss__elements_complaint(d, &r);
+    if (wrong) return tss__n_refuse(&h, r, wrong);
+    tss_elements *e = tss__elements_alloc(&h, d);
+    size_t bytes = (size_t)d->nodes * sizeof(int);
+    int *number = e ? (int *)tss_alloc(&h, bytes) : NULL;
+    if (!number) {
+        tss_elements_destroy(e);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    r = tss__elements_fill(e, d, number);
+    tss_free(&h, number, bytes);
+    if (r != TSS_OK) {
+        tss_elements_destroy(e);
+        return tss__n_refuse(&h, r, "elements: a cell is flat or inverted");
+    }
+    *out = e;
+    return TSS_OK;
+}
+
+// ---- jets of the elements -------------------------------------------------------------------
+
+enum { TSS__CELL_VALUE, TSS__CELL_REVERSE, TSS__CELL_TANGENT };
+
+typedef struct tss__n_jet {  // one sample; rows of x: base, k, second
+    const tss_elements *e;
+    const int *cell;  // e->cell or e->local: how rows are numbered
+    int mode, k, second;
+    const double *x;
+    size_t ld;        // from row to row
+    const double *C;  // k × k, or NULL
+    double alpha, gamma;
+    const double *beta;  // k, or NULL: 0
+    double *bar;         // rows as x, added to; NULL: VALUE
+    double P, P2, *P1;   // P1: k, or NULL
+    double *scratch;     // (3 cols + 2)·9
+} tss__n_jet;
+
+static void tss__jet_gather(const tss__n_jet *t, int k, int cols, double *F) {
+    int d = t->e->dim;
+    const int *v = t->cell + k * (d + 1);
+    const double *Dinv = t->e->Dinv + k * d * d;
+    for (int c = 0; c < cols; c++, F += 9) {
+        const double *x = t->x + (size_t)c * t->ld;
+        for (int r = 0; r < d; r++) {
+            double edge[3], x0 = x[v[0] * d + r];
+            for (int i = 0; i < d; i++) edge[i] = x[v[i + 1] * d + r] - x0;
+            for (int m = 0; m < d; m++) {
+                double s = 0;
+                for (int i = 0; i < d; i++) s += edge[i] * Dinv[i * d + m];
+                F[r * d + m] = s;
+            }
+        }
+    }
+}
+
+static void tss__jet_scatter(const tss__n_jet *t, int k, int cols, const double *Fbar) {
+    int d = t->e->dim;
+    const int *v = t->cell + k * (d + 1);
+    const double *Dinv = t->e->Dinv + k * d * d;
+    for (int c = 0; c < cols; c++, Fbar += 9) {
+        double *to = t->bar + (size_t)c * t->ld;
+        for (int r = 0; r < d; r++)
+            for (int i = 0; i < d; i++) {
+                double s = t->e->vol[k] * tss__dot_n(d, Fbar + r * d, Dinv + i * d);
+                to[v[i + 1] * d + r] += s, to[v[0] * d + r] -= s;
+            }
+    }
+}
+
+// F̂_a = Σ_b C_ab F_b, and the second-order value Σ_a Ψ''[F_a, F̂_a] + Ψ':F_2.
+static double tss__jet_second(const tss__n_jet *t, const tss__n_cell *q, const double *F,
+                              double *hat) {
+    double s = tss__dot_n(q->dd, q->P, F + 9 * (t->k + 1));
+    for (int a = 0; a < t->k; a++) {
+        double *h = hat + 9 * a, D[9] = {0};
+        tss__n_zero(h, 9);
+        for (int b = 0; b < t->k; b++)
+            for (int i = 0; i < q->dd; i++) h[i] += t->C[a * t->k + b] * F[9 * (b + 1) + i];
+        tss__cell_dd(q, F + 9 * (a + 1), D);
+        s += tss__dot_n(q->dd, D, h);
+    }
+    return s;
+}
+
+// The adjoint of alpha P + Σ beta_a P_a + gamma P_2 at one cell (docs/neural.md):
+//     F̄_2 = γ Ψ',  F̄_a = β_a Ψ' + 2γ Ψ''[F̂_a],
+//     F̄  = α Ψ' + Ψ''[Σ β_a F_a + γ F_2] + γ Σ Ψ'''[F_a, F̂_a].
+static void tss__jet_reverse(const tss__n_jet *t, const tss__n_cell *q, const double *F,
+                             const double *hat, double *bar) {
+    int k = t->k, dd = q->dd;
+    double mix[9] = {0};
+    for (int i = 0; i < dd; i++) bar[i] = t->alpha * q->P[i];
+    for (int a = 0; a < k; a++) {
+        double *ba = bar + 9 * (a + 1), b = t->beta ? t->beta[a] : 0;
+        for (int i = 0; i < dd; i++) ba[i] = b * q->P[i], mix[i] += b * F[9 * (a + 1) + i];
+        if (!t->second) continue;
+        double D[9] = {0};
+        tss__cell_dd(q, hat + 9 * a, D);
+        for (int i = 0; i < dd; i++) ba[i] += 2 * t->gamma * D[i];
+        tss__cell_ddd(q, t->gamma, F + 9 * (a + 1), hat + 9 * a, bar);
+    }
+    for (int i = 0; t->second && i < dd; i++)
+        bar[9 * (k + 1) + i] = t->gamma * q->P[i], mix[i] += t->gamma * F[9 * (k + 1) + i];
+    if (k > 0) tss__cell_dd(q, mix, bar);
+}
+
+// The adjoint of P and its derivatives along the F_a.
+static void tss__jet_tangent(const tss__n_jet *t, const tss__n_cell *q, const double *F,
+                             double *bar) {
+    memcpy(bar, q->P, (size_t)q->dd * sizeof(double));
+    for (int a = 1; a <= t->k; a++) {
+        tss__n_zero(bar + 9 * a, 9);
+        tss__cell_dd(q, F + 9 * a, bar + 9 * a);
+    }
+}
+
+static void tss__jet_run(tss__n_jet *t) {
+    int cols = 1 + t->k + t->second, d = t->e->dim;
+    double *F = t->scratch, *hat = F + 9 * cols, *bar = hat + 9 * (t->k + 1);
+    t->P = t->P2 = 0;
+    if (t->P1) tss__n_zero(t->P1, (size_t)t->k);
+    for (int k = 0; k < t->e->cells; k++) {
+        tss__n_cell q;
+        double vol = t->e->vol[k];
+        tss__jet_gather(t, k, cols, F);
+        tss__cell_at(&q, d, t->e->mu[k], t->e->la[k], F);
+        t->P += vol * q.psi;
+        for (int a = 0; t->P1 && a < t->k; a++)
+            t->P1[a] += vol * tss__dot_n(q.dd, q.P, F + 9 * (a + 1));
+        if (t->second) t->P2 += vol * tss__jet_second(t, &q, F, hat);
+        if (t->mode == TSS__CELL_VALUE) continue;
+        if (t->mode == TSS__CELL_TANGENT)
+            tss__jet_tangent(t, &q, F, bar);
+        else
+            tss__jet_reverse(t, &q, F, hat, bar);
+        tss__jet_scatter(t, k, cols, bar);
+    }
+}
+
+double tss_elements_potential(const tss_elements *e, const double *x, double *g) {
+    double scratch[5 * 9];
+    tss__n_jet t;
+    memset(&t, 0, sizeof t);
+    t.e = e, t.cell = e->cell, t.mode = g ? TSS__CELL_REVERSE : TSS__CELL_VALUE;
+    t.x = x, t.alpha = 1, t.bar = g, t.scratch = scratch;
+    tss__jet_run(&t);
+    return t.P;
+}
+
+tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, const double *x1,
+                             const double *C, const double *x2, double *P, double *P1, double *P2,
+                             double alpha, const double *beta, double gamma, double *x_bar,
+                             double *x1_bar, double *x2_bar) {
+    if (k < 0 || (k > 0 && !x1) || !C != !x2 || (C && k == 0)) return TSS_ERROR_BAD_ARGUMENT;
+    size_t n = (size_t)(e->nodes * e->dim), wide = n * sizeof(double), K = (size_t)k;
+    size_t cols = 1 + K + (C != NULL), count = 2 * cols * n + 9 * (3 * cols + 2);
+    double *p = (double *)tss_alloc(&e->host, count * sizeof(double));
+    if (!p) return TSS_ERROR_NO_MEMORY;
+    tss__n_zero(p, count);
+    tss__n_jet t;
+    memset(&t, 0, sizeof t);
+    t.e = e, t.cell = e->cell, t.mode = TSS__CELL_REVERSE, t.k = k, t.second = C != NULL, t.x = p,
+    t.ld = n;
+    t.C = C, t.alpha = alpha, t.beta = beta, t.gamma = gamma, t.bar = p + cols * n, t.P1 = P1;
+    t.scratch = t.bar + cols * n;
+    memcpy(p, x, wide);
+    if (k) memcpy(p + n, x1, K * wide);
+    if (C) memcpy(p + (1 + K) * n, x2, wide);
+    tss__jet_run(&t);
+    if (P) *P = t.P;
+    if (P2) *P2 = t.P2;
+    for (size_t i = 0; x_bar && i < n; i++) x_bar[i] += t.bar[i];
+    for (size_t i = 0; x1_bar && i < K * n; i++) x1_bar[i] += t.bar[n + i];
+    for (size_t i = 0; x2_bar && C && i < n; i++) x2_bar[i] += t.bar[(1 + K) * n + i];
+    tss_free(&e->host, p, count * sizeof(double));
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>reduced (private)
+// One job serves all that is asked of P(f(z)): values, reverse passes with seeds, and Hessians
+// times directions (the tangent of the reverse pass). Only the coordinates that elements touch are
+// made.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss__n_reduced {
+    tss__jetpass p;
+    const tss_elements *e;
+    int mode;
+    const double *z, *D;
+    size_t stride;                  // of D from sample to sample
+    const double *alpha;            // batch, or NULL: all_alpha
+    double all_alpha, beta, gamma;  // beta: of each direction
+    double *betas;                  // k times beta
+    double *P, *P2;                 // batch, or NULL
+    double *gradient;  // batch × r: of the seeded sum in z (TANGENT: ∇P); overwritten; or NULL
+    double *HD;        // TANGENT: batch × k × r, or NULL
+    double *cell_scratch;
+} tss__n_reduced;
+
+static int tss__n_fits(const tss_net *n, const tss_elements *e) {
+    return !n->has_in && n->outputs == e->nodes * e->dim;
+}
+
+static void tss__reduced_init(tss__n_reduced *j, const tss_net *n, const tss_elements *e, int mode,
+                              int batch, int k, const double *C) {
+    memset(j, 0, sizeof *j);
+    int all = e->used == e->nodes;
+    j->p = tss__jetpass_of(n, batch, k, C, all ? NULL : e->dof, e->used * e->dim);
+    j->e = e, j->mode = mode, j->all_alpha = 1;
+}
+
+static void tss__reduced_plan(tss__n_reduced *j, tss__n_slab *s, int theta) {
+    int reverse = j->mode != TSS__CELL_VALUE;
+    tss__jetpass_plan(&j->p, s,
+                      TSS__PASS_X | (reverse ? TSS__PASS_XBAR : 0) | (theta ? TSS__PASS_THETA : 0));
+    j->cell_scratch = tss__n_take(s, j->p.chunks, (size_t)(3 * j->p.cols + 2) * 9);
+    j->betas = tss__n_take(s, 1, (size_t)j->p.k);
+}
+
+static void tss__reduced_elements(tss__n_reduced *j, int c) {
+    const tss__jetpass *p = &j->p;
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    if (j->mode != TSS__CELL_VALUE)
+        tss__n_zero(tss__jetpass_xbar(p, c), tss__jetpass_rows(p, c) * p->coords);
+    for (int i = first; i < first + count; i++) {
+        size_t row = (size_t)i * (size_t)p->cols * p->coords;
+        tss__n_jet t;
+        memset(&t, 0, sizeof t);
+        t.e = j->e, t.cell = p->dof ? j->e->local : j->e->cell, t.mode = j->mode, t.k = p->k;
+        t.second = p->second, t.x = p->x + row, t.ld = p->coords;
+        t.C = p->second ? p->C + (size_t)i * (size_t)(p->k * p->k) : NULL;
+        t.alpha = j->alpha ? j->alpha[i] : j->all_alpha, t.beta = j->betas, t.gamma = j->gamma;
+        t.bar = j->mode != TSS__CELL_VALUE ? p->xbar + row : NULL;
+        t.scratch = j->cell_scratch + (size_t)c * (size_t)(3 * p->cols + 2) * 9;
+        tss__jet_run(&t);
+        if (j->P) j->P[i] = t.P;
+        if (j->P2) j->P2[i] = t.P2;
+    }
+}
+
+static void tss__reduced_task(int c, int worker, void *arg) {
+    (void)worker;
+    tss__n_reduced *j = (tss__n_reduced *)arg;
+    const tss__jetpass *p = &j->p;
+    size_t r = (size_t)p->net->width[0], k = (size_t)p->k, wide = r * sizeof(double);
+    tss__jetpass_load(p, c, j->z, j->D, j->stride);
+    tss__jetpass_forward(p, c);
+    tss__jetpass_out(p, c);
+    tss__reduced_elements(j, c);
+    if (j->mode == TSS__CELL_VALUE) return;
+    tss__jetpass_in_bar(p, c, tss__jetpass_xbar(p, c));
+    const double *bar = tss__jetpass_backward(p, c, j->mode == TSS__CELL_TANGENT);
+    int first = tss__jetpass_sample(p, c), count = tss__jetpass_samples(p, c);
+    for (int i = 0; i < count; i++, bar += (size_t)p->cols * r) {
+        size_t s = (size_t)(first + i);
+        if (j->gradient) memcpy(j->gradient + s * r, bar, wide);
+        if (j->HD) memcpy(j->HD + s * k * r, bar + r, k * wide);
+    }
+}
+
+static void tss__reduced_run(tss__n_reduced *j, tss_work *w) {
+    for (int a = 0; a < j->p.k; a++) j->betas[a] = j->beta;
+    tss_parallel(&w->host, j->p.chunks, tss__reduced_task, j);
+}
+
+static void tss__n_identity(double *D, int r) {
+    tss__n_zero(D, (size_t)(r * r));
+    for (int a = 0; a < r; a++) D[a * r + a] = 1;
+}
+
+tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
+                                 const double *z, double *P, double *gradient, double *hessian) {
+    if (batch < 1 || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_reduced j;
+    tss__n_slab s = {NULL, 0, 0};
+    int r = n->width[0], k = hessian ? r : 0;
+    double *D = NULL;
+    tss__reduced_init(&j, n, e,
+                      hessian    ? TSS__CELL_TANGENT
+                      : gradient ? TSS__CELL_REVERSE
+                                 : TSS__CELL_VALUE,
+                      batch, k, NULL);
+    for (int pass = 0; pass < 2; pass++) {
+        tss__reduced_plan(&j, &s, 0);
+        D = tss__n_take(&s, k, (size_t)r);
+        if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    }
+    if (hessian) tss__n_identity(D, r);
+    j.z = z, j.D = D, j.P = P, j.gradient = gradient, j.HD = hessian;
+    tss__reduced_run(&j, w);
+    return TSS_OK;
+}
+
+tss_result tss_reduced_second(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
+                              const double *z, const double *u, const double *v, double *out) {
+    if (batch < 1 || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_reduced j;
+    tss__n_slab s = {NULL, 0, 0};
+    size_t r = (size_t)n->width[0], B = (size_t)batch;
+    double *D = NULL, *C = NULL, dummy = 0;
+    tss__reduced_init(&j, n, e, TSS__CELL_VALUE, batch, 2, &dummy);
+    for (int pass = 0; pass < 2; pass++) {
+        tss__reduced_plan(&j, &s, 0);
+        D = tss__n_take(&s, batch, 2 * r), C = tss__n_take(&s, batch, 4);
+        if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    }
+    for (size_t i = 0; i < B; i++) {
+        memcpy(D + 2 * r * i, u + r * i, r * sizeof(double));
+        memcpy(D + 2 * r * i + r, v + r * i, r * sizeof(double));
+        C[4 * i] = C[4 * i + 3] = 0, C[4 * i + 1] = C[4 * i + 2] = 0.5;
+    }
+    j.z = z, j.D = D, j.stride = 2 * r, j.p.C = C, j.P2 = out;
+    tss__reduced_run(&j, w);
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>losses (private)
+// ---------------------------------------------------------------------------------------------
+
+static double tss__n_mean(const double *a, int count) {
+    double s = 0;
+    for (int i = 0; i < count; i++) s += a[i];
+    return s / count;
+}
+
+typedef struct tss__n_recon {
+    tss__jetpass enc, dec;
+    const double *x, *mass;
+    double *loss;  // of each sample
+} tss__n_recon;
+
+static void tss__recon_task(int c, int worker, void *arg) {
+    (void)worker;
+    tss__n_recon *j = (tss__n_recon *)arg;
+    const tss__jetpass *e = &j->enc, *d = &j->dec;
+    size_t n = d->coords;
+    tss__jetpass_load(e, c, j->x, NULL, 0), tss__jetpass_forward(e, c), tss__jetpass_out(e, c);
+    tss__jetpass_load(d, c, e->x, NULL, 0), tss__jetpass_forward(d, c), tss__jetpass_out(d, c);
+    int first = tss__jetpass_sample(d, c), count = tss__jetpass_samples(d, c);
+    for (int s = first; s < first + count; s++) {
+        double sum = 0;
+        for (size_t i = 0; i < n; i++) {
+            double m = j->mass ? j->mass[i] : 1,
+                   gap = d->x[(size_t)s * n + i] - j->x[(size_t)s * n + i];
+            sum += m * gap * gap;
+            d->xbar[(size_t)s * n + i] = 2 * m * gap / d->batch;
+        }
+        j->loss[s] = sum;
+    }
+    if (!d->theta && !e->theta) return;
+    tss__jetpass_in_bar(d, c, tss__jetpass_xbar(d, c));
+    const double *zbar = tss__jetpass_backward(d, c, 0);
+    if (!e->theta) return;
+    tss__jetpass_in_bar(e, c, zbar);
+    tss__jetpass_backward(e, c, 0);
+}
+
+tss_result tss_loss_reconstruction(const tss_net *dec, const tss_net *enc, tss_work *w,
+                                   const double *mass, int batch, const double *x, double weight,
+                                   double *loss, double *decoder_bar, double *encoder_bar) {
+    if (batch < 1 || dec->has_in || enc->outputs != dec->inputs || enc->inputs != dec->outputs)
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_recon j;
+    tss__n_slab s = {NULL, 0, 0};
+    j.enc = tss__jetpass_of(enc, batch, 0, NULL, NULL, 0);
+    j.dec = tss__jetpass_of(dec, batch, 0, NULL, NULL, 0);
+    for (int pass = 0; pass < 2; pass++) {
+        tss__jetpass_plan(&j.enc, &s, TSS__PASS_X | (encoder_bar ? TSS__PASS_THETA : 0));
+        tss__jetpass_plan(&j.dec, &s,
+                          TSS__PASS_X | TSS__PASS_XBAR | (decoder_bar ? TSS__PASS_THETA : 0));
+        j.loss = tss__n_take(&s, batch, 1);
+        if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    }
+    j.x = x, j.mass = mass;
+    tss_parallel(&w->host, j.dec.chunks, tss__recon_task, &j);
+    if (loss) *loss = tss__n_mean(j.loss, batch);
+    tss__jetpass_collect(&w->host, &j.dec, weight, decoder_bar);
+    tss__jetpass_collect(&w->host, &j.enc, weight, encoder_bar);
+    return TSS_OK;
+}
+
+// ---- unsupervised ---------------------------------------------------------------------------
+
+typedef struct tss__n_unsup {
+    tss__n_reduced r;
+    const double *mass;
+    double lambda, sigma2, eps;
+    double *P, *repulsion;  // of each sample
+} tss__n_unsup;
+
+static void tss__unsup_forward_task(int c, int worker, void *arg) {
+    (void)worker;
+    tss__n_unsup *j = (tss__n_unsup *)arg;
+    tss__jetpass_load(&j->r.p, c, j->r.z, NULL, 0);
+    tss__jetpass_forward(&j->r.p, c);
+    tss__jetpass_out(&j->r.p, c);
+    tss__reduced_elements(&j->r, c);
+}
+
+// Sample i against all others: q = ½ ln((‖Δf‖² + eps) / (σ²‖Δz‖² + eps)), mean of q² and its force.
+static void tss__unsup_pair_task(int i, int worker, void *arg) {
+    (void)worker;
+    tss__n_unsup *j = (tss__n_unsup *)arg;
+    const tss__jetpass *p = &j->r.p;
+    size_t n = p->coords, r = (size_t)p->net->width[0];
+    const double *xi = p->x + (size_t)i * n, *zi = j->r.z + (size_t)i * r;
+    double *bar = p->xbar + (size_t)i * n, sum = 0;
+    double share = 4 * j->lambda / ((double)p->batch * (p->batch - 1));
+    for (int o = 0; o < p->batch; o++) {
+        const double *xo = p->x + (size_t)o * n, *zo = j->r.z + (size_t)o * r;
+        double df = 0, dz = 0;
+        if (o == i) continue;
+        for (size_t a = 0; a < n; a++)
+            df += (j->mass ? j->mass[a] : 1) * (xi[a] - xo[a]) * (xi[a] - xo[a]);
+        for (size_t a = 0; a < r; a++) dz += (zi[a] - zo[a]) * (zi[a] - zo[a]);
+        double q = 0.5 * (log(df + j->eps) - log(j->sigma2 * dz + j->eps));
+        double f = share * q / (df + j->eps);
+        sum += q * q;
+        for (size_t a = 0; a < n; a++) bar[a] += f * (j->mass ? j->mass[a] : 1) * (xi[a] - xo[a]);
+    }
+    j->repulsion[i] = sum / (p->batch - 1);
+}
+
+static void tss__unsup_backward_task(int c, int worker, void *arg) {
+    (void)worker;
+    const tss__jetpass *p = &((tss__n_unsup *)arg)->r.p;
+    tss__jetpass_in_bar(p, c, tss__jetpass_xbar(p, c));
+    tss__jetpass_backward(p, c, 0);
+}
+
+tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_work *w,
+                                 const double *mass, double lambda, double sigma, double eps,
+                                 int batch, const double *z, double weight, double *loss,
+                                 double *parts, double *decoder_bar) {
+    if (batch < 2 || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_unsup j;
+    tss__n_slab s = {NULL, 0, 0};
+    tss__reduced_init(&j.r, dec, e, TSS__CELL_REVERSE, batch, 0, NULL);
+    // All coordinates: the distances of the repulsion need them.
+    j.r.p.dof = NULL, j.r.p.coords = (size_t)dec->outputs;
+    for (int pass = 0; pass < 2; pass++) {
+        tss__reduced_plan(&j.r, &s, decoder_bar != NULL);
+        j.P = tss__n_take(&s, batch, 1), j.repulsion = tss__n_take(&s, batch, 1);
+        if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    }
+    j.r.z = z, j.r.P = j.P, j.r.all_alpha = 1.0 / batch;
+    j.mass = mass, j.lambda = lambda, j.sigma2 = sigma * sigma, j.eps = eps;
+    tss_parallel(&w->host, j.r.p.chunks, tss__unsup_forward_task, &j);
+    tss_parallel(&w->host, batch, tss__unsup_pair_task, &j);
+    double potential = tss__n_mean(j.P, batch), repulsion = tss__n_mean(j.repulsion, batch);
+    if (loss) *loss = potential + lambda * repulsion;
+    if (parts) parts[0] = potential, parts[1] = repulsion;
+    if (!decoder_bar) return TSS_OK;
+    tss_parallel(&w->host, j.r.p.chunks, tss__unsup_backward_task, &j);
+    tss__jetpass_collect(&w->host, &j.r.p, weight, decoder_bar);
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>lipschitz (private)
+// Every variant is the mean over pairs of ‖φ_i − φ_j‖² / ‖z_i − z_j‖² for some features φ of a
+// sample:
+//     order 0: P;  1: ∇P;  2: ∇²P;  UV: uᵀ∇²P v;  U: ∇²P u   (probes: side by side, divided by
+//     √probes)
+// A first pass gives φ; pairs give φ̄; a second pass gives the gradient of ⟨φ̄, φ⟩ for fixed φ̄. That
+// is one jet: α = φ̄;  D = φ̄, β = 1;  D = I, C = φ̄;  D = (u, w), C = [0 ½; ½ 0], w = φ̄ v or φ̄.
+// ---------------------------------------------------------------------------------------------
+
+tss_lipschitz_def tss_lipschitz_def_default(void) {
+    tss_lipschitz_def d;
+    memset(&d, 0, sizeof d);
+    d.order = 2, d.probes = 1, d.floor = 1e-12;
+    return d;
+}
+
+typedef struct tss__n_lip {
+    tss_lipschitz_def def;
+    int batch, r, m, k;  // features; directions of the second pass
+    tss__n_reduced first, second;
+    const double *z, *probe;
+    double *phi, *bar;  // batch × m
+    double *zbar;       // batch × r, of the distances
+    double *zjet;       // batch × r, of the features
+    double *loss;       // batch
+    double *HD, *D1, *D, *C;
+} tss__n_lip;
+
+static int tss__lip_random(const tss__n_lip *l) { return l->def.estimator != TSS_LIPSCHITZ_EXACT; }
+
+static void tss__lip_init(tss__n_lip *l, const tss_net *n, const tss_elements *e,
+                          const tss_lipschitz_def *def, int batch) {
+    static const double marker = 0;  // "there is a C": set before the run
+    int r = n->width[0], order = def->order, random = def->estimator != TSS_LIPSCHITZ_EXACT;
+    memset(l, 0, sizeof *l);
+    l->def = *def, l->batch = batch, l->r = r;
+    int k1 = order < 2 ? 0 : random ? def->probes : r;
+    l->m = order == 0 ? 1 : order == 1 ? r : def->estimator == TSS_LIPSCHITZ_UV ? k1 : k1 * r;
+    // Once the probes' vectors are as many as r, the coordinates serve as well.
+    l->k = order < 2 ? order : random && 2 * k1 < r ? 2 * k1 : r;
+    tss__reduced_init(&l->first, n, e,
+                      order == 0   ? TSS__CELL_VALUE
+                      : order == 1 ? TSS__CELL_REVERSE
+                                   : TSS__CELL_TANGENT,
+                      batch, k1, NULL);
+    tss__reduced_init(&l->second, n, e, TSS__CELL_REVERSE, batch, l->k,
+                      order == 2 ? &marker : NULL);
+}
+
+static void tss__lip_plan(tss__n_lip *l, tss__n_slab *s, int reverse, int theta) {
+    size_t r = (size_t)l->r, k = (size_t)l->k, m = (size_t)l->m;
+    tss__reduced_plan(&l->first, s, 0);
+    l->phi = tss__n_take(s, l->batch, m);
+    l->HD = tss__n_take(s, l->batch, (size_t)l->first.p.k * r);
+    l->D1 = tss__n_take(s, l->first.p.k, r);
+    l->loss = tss__n_take(s, l->batch, 1);
+    if (!reverse) return;
+    tss__reduced_plan(&l->second, s, theta);
+    l->bar = tss__n_take(s, l->batch, m);
+    l->zbar = tss__n_take(s, l->batch, r), l->zjet = tss__n_take(s, l->batch, r);
+    l->D = tss__n_take(s, l->batch, k * r), l->C = tss__n_take(s, l->batch, k * k);
+}
+
+static void tss__lip_features(tss__n_lip *l, tss_work *w) {
+    size_t r = (size_t)l->r, K = (size_t)l->first.p.k, B = (size_t)l->batch;
+    tss__n_reduced *j = &l->first;
+    j->z = l->z, j->D = l->D1;
+    if (l->def.order == 0) j->P = l->phi;
+    if (l->def.order == 1) j->gradient = l->phi;
+    if (l->def.order == 2) j->HD = l->HD;
+    if (l->def.order == 2 && !tss__lip_random(l)) tss__n_identity(l->D1, l->r);
+    for (size_t k = 0; tss__lip_random(l) && k < K; k++)
+        memcpy(l->D1 + k * r, l->probe + 2 * k * r, r * sizeof(double));
+    tss__reduced_run(j, w);
+    if (l->def.order < 2) return;
+    double share = tss__lip_random(l) ? 1 / sqrt((double)K) : 1;
+    for (size_t i = 0; i < B * K; i++) {
+        const double *Hu = l->HD + i * r;
+        if (l->def.estimator == TSS_LIPSCHITZ_UV)
+            l->phi[i] = share * tss__dot_n(l->r, Hu, l->probe + (2 * (i % K) + 1) * r);
+        else
+            for (size_t a = 0; a < r; a++) l->phi[i * r + a] = share * Hu[a];
+    }
+}
+
+static double tss__n_gap(const double *a, const double *b, size_t n) {
+    double s = 0;
+    for (size_t i = 0; i < n; i++) s += (a[i] - b[i]) * (a[i] - b[i]);
+    return s;
+}
+
+static void tss__lip_pair_task(int i, int worker, void *arg) {
+    (void)worker;
+    tss__n_lip *l = (tss__n_lip *)arg;
+    size_t m = (size_t)l->m, r = (size_t)l->r, at = (size_t)i;
+    const double *fi = l->phi + at * m, *zi = l->z + at * r;
+    double share = 4 / ((double)l->batch * (l->batch - 1)), sum = 0;
+    if (l->bar) tss__n_zero(l->bar + at * m, m), tss__n_zero(l->zbar + at * r, r);
+    for (size_t o = 0; o < (size_t)l->batch; o++) {
+        const double *fo = l->phi + o * m, *zo = l->z + o * r;
+        if (o == at) continue;
+        double dz = l->def.undivided ? 1 : tss__n_gap(zi, zo, r), df = tss__n_gap(fi, fo, m);
+        int floored = l->def.undivided || dz <= l->def.floor;
+        if (floored && !l->def.undivided) dz = l->def.floor;
+        if (dz == 0) continue;  // twice the same sample, and no floor
+        sum += df / dz;
+        if (!l->bar) continue;
+        for (size_t a = 0; a < m; a++) l->bar[at * m + a] += share / dz * (fi[a] - fo[a]);
+        for (size_t a = 0; !floored && a < r; a++)
+            l->zbar[at * r + a] -= share * df / (dz * dz) * (zi[a] - zo[a]);
+    }
+    l->loss[i] = sum / (l->batch - 1);
+}
+
+// D and C of the second pass for sample i, order 2.
+static void tss__lip_jet(tss__n_lip *l, size_t i) {
+    size_t r = (size_t)l->r, k = (size_t)l->k, K = (size_t)l->first.p.k;
+    double *D = l->D + i * k * r, *C = l->C + i * k * k;
+    double share = 1 / sqrt((double)K);
+    int direct = tss__lip_random(l) && k == 2 * K && k < r;
+    tss__n_zero(C, k * k);
+    if (!direct) tss__n_identity(D, l->r);
+    for (size_t p = 0; p < K; p++) {
+        if (!tss__lip_random(l)) {  // C = the symmetric part of φ̄
+            for (size_t a = 0; a < r; a++) {
+                double f = 0.5 * l->bar[i * (size_t)l->m + p * r + a];
+                C[p * r + a] += f, C[a * r + p] += f;
+            }
+            continue;
+        }
+        const double *u = l->probe + 2 * p * r, *v = u + r, *w = v;
+        double f = share;
+        if (l->def.estimator == TSS_LIPSCHITZ_UV)
+            f *= l->bar[i * K + p];
+        else
+            w = l->bar + (i * K + p) * r;
+        if (direct) {
+            memcpy(D + 2 * p * r, u, r * sizeof(double));
+            for (size_t a = 0; a < r; a++) D[(2 * p + 1) * r + a] = f * w[a];
+            C[2 * p * k + 2 * p + 1] = C[(2 * p + 1) * k + 2 * p] = 0.5;
+        } else {
+            for (size_t a = 0; a < r; a++)
+                for (size_t b = 0; b < r; b++)
+                    C[a * r + b] += 0.5 * f * (u[a] * w[b] + w[a] * u[b]);
+        }
+    }
+}
+
+static void tss__lip_reverse(tss__n_lip *l, tss_work *w) {
+    tss__n_reduced *j = &l->second;
+    j->z = l->z, j->gradient = l->zjet, j->all_alpha = 0;
+    j->D = l->D, j->stride = (size_t)(l->k * l->r);
+    if (l->def.order == 0) j->alpha = l->bar;
+    if (l->def.order == 1) j->D = l->bar, j->beta = 1;
+    if (l->def.order == 2) j->p.C = l->C, j->gamma = 1;
+    for (size_t i = 0; l->def.order == 2 && i < (size_t)l->batch; i++) tss__lip_jet(l, i);
+    tss__reduced_run(j, w);
+}
+
+static int tss__lip_valid(const tss_net *n, const tss_elements *e, const tss_lipschitz_def *d,
+                          int batch, const double *probe) {
+    int random = d->estimator != TSS_LIPSCHITZ_EXACT;
+    return batch >= 2 && tss__n_fits(n, e) && d->order >= 0 && d->order <= 2 &&
+           (unsigned)d->estimator <= TSS_LIPSCHITZ_U && d->floor >= 0 && d->floor < 1e300 &&
+           (!random || (d->order == 2 && probe && d->probes >= 1 && d->probes <= n->width[0]));
+}
+
+tss_result tss_loss_lipschitz(const tss_net *dec, const tss_elements *e, tss_work *w,
+                              const tss_lipschitz_def *def, int batch, const double *z,
+                              const double *probe, double weight, double *loss, double *decoder_bar,
+                              double *z_bar) {
+    if (!tss__lip_valid(dec, e, def, batch, probe)) return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_lip l;
+    tss__n_slab s = {NULL, 0, 0};
+    int reverse = decoder_bar || z_bar;
+    tss__lip_init(&l, dec, e, def, batch);
+    for (int pass = 0; pass < 2; pass++) {
+        tss__lip_plan(&l, &s, reverse, decoder_bar != NULL);
+        if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    }
+    l.z = z, l.probe = probe;
+    tss__lip_features(&l, w);
+    tss_parallel(&w->host, batch, tss__lip_pair_task, &l);
+    if (loss) *loss = tss__n_mean(l.loss, batch);
+    if (!reverse) return TSS_OK;
+    tss__lip_reverse(&l, w);
+    tss__jetpass_collect(&w->host, &l.second.p, weight, decoder_bar);
+    for (size_t i = 0; z_bar && i < (size_t)(batch * l.r); i++)
+        z_bar[i] += weight * (l.zbar[i] + l.zjet[i]);
+    return TSS_OK;
+}
+
+static void tss__lip_max_task(int i, int worker, void *arg) {
+    (void)worker;
+    tss__n_lip *l = (tss__n_lip *)arg;
+    size_t m = (size_t)l->m, r = (size_t)l->r, at = (size_t)i;
+    double most = 0;
+    for (size_t o = at + 1; o < (size_t)l->batch; o++) {
+        double dz = tss__n_gap(l->z + at * r, l->z + o * r, r);
+        double f = dz > 0 ? tss__n_gap(l->phi + at * m, l->phi + o * m, m) / dz : 0;
+        most = f > most || isnan(f) ? f : most;
+    }
+    l->loss[i] = most;
+}
+
+tss_result tss_lipschitz_estimate(const tss_net *dec, const tss_elements *e, tss_work *w, int order,
+                                  int batch, const double *z, double *out) {
+    tss_lipschitz_def def = tss_lipschitz_def_default();
+    def.order = order;
+    if (!tss__lip_valid(dec, e, &def, batch, NULL)) return TSS_ERROR_BAD_ARGUMENT;
+    tss__n_lip l;
+    tss__n_slab s = {NULL, 0, 0};
+    tss__lip_init(&l, dec, e, &def, batch);
+    for (int pass = 0; pass < 2; pass++) {
+        tss__lip_plan(&l, &s, 0, 0);
+        if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
+    }
+    l.z = z;
+    tss__lip_features(&l, w);
+    tss_parallel(&w->host, batch, tss__lip_max_task, &l);
+    double most = 0;
+    for (int i = 0; i < batch; i++) most = l.loss[i] > most || isnan(l.loss[i]) ? l.loss[i] : most;
+    *out = sqrt(most);
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>cubature (private)
+// min ‖G w − b‖, w >= 0, with at most `count` weights: G has a column of samples · r numbers for
+// each candidate. The normal equations of the chosen columns are kept with their Cholesky factor,
+// which grows by a row a cell and is made anew when one leaves.
+// ---------------------------------------------------------------------------------------------
+
+tss_cubature_def tss_cubature_def_default(void) {
+    tss_cubature_def d = {300, 0, 0, 0};
+    return d;
+}
+
+typedef struct tss__cub {
+    const tss_host *host;
+    int candidates, most, chosen;
+    size_t m;
+    double *G, *norm, *b, *rest, *match;  // columns, their norms; b; b − G w; Gᵀ rest / norm
+    double *A, *L, *rhs, *w, *s;          // most × most twice, then most each
+    int *cell, *in;                       // of each candidate; candidates chosen
+    uint8_t *out;                         // 1: chosen, or of no use
+} tss__cub;
+
+static void tss__cub_match_task(int block, int worker, void *arg) {
+    (void)worker;
+    tss__cub *c = (tss__cub *)arg;
+    int end = 64 * (block + 1) < c->candidates ? 64 * (block + 1) : c->candidates;
+    for (int k = 64 * block; k < end; k++)
+        c->match[k] =
+            c->out[k] ? 0 : tss__dot_n((int)c->m, c->G + (size_t)k * c->m, c->rest) / c->norm[k];
+}
+
+static void tss__cub_residual(tss__cub *c) {
+    memcpy(c->rest, c->b, c->m * sizeof(double));
+    for (int i = 0; i < c->chosen; i++) {
+        const double *g = c->G + (size_t)c->in[i] * c->m;
+        for (size_t k = 0; k < c->m; k++) c->rest[k] -= c->w[i] * g[k];
+    }
+}
+
+// Row i of the factor, from row i of A. 0: the column depends on those before it.
+static int tss__cub_factor_row(tss__cub *c, int i) {
+    size_t ld = (size_t)c->most;
+    double *row = c->L + (size_t)i * ld;
+    const double *A = c->A + (size_t)i * ld;
+    for (int j = 0; j <= i; j++) {
+        const double *lj = c->L + (size_t)j * ld;
+        double s = A[j] - tss__dot_n(j, row, lj);
+        if (j < i)
+            row[j] = s / lj[j];
+        else if (!(s > 1e-10 * A[i]))
+            return 0;
+        else
+            row[i] = sqrt(s);
+    }
+    return 1;
+}
+
+static int tss__cub_push(tss__cub *c, int candidate) {
+    const double *g = c->G + (size_t)candidate * c->m;
+    int i = c->chosen;
+    c->in[i] = candidate, c->out[candidate] = 1;
+    for (int j = 0; j <= i; j++)
+        c->A[(size_t)i * (size_t)c->most + (size_t)j] =
+            tss__dot_n((int)c->m, g, c->G + (size_t)c->in[j] * c->m);
+    c->rhs[i] = tss__dot_n((int)c->m, g, c->b), c->w[i] = 0;
+    if (!tss__cub_factor_row(c, i)) return 0;
+    c->chosen++;
+    return 1;
+}
+
+static void tss__cub_solve(tss__cub *c) {
+    size_t ld = (size_t)c->most;
+    for (int i = 0; i < c->chosen; i++)
+        c->s[i] = (c->rhs[i] - tss__dot_n(i, c->L + (size_t)i * ld, c->s)) /
+                  c->L[(size_t)i * ld + (size_t)i];
+    for (int i = c->chosen - 1; i >= 0; i--) {
+        double s = c->s[i];
+        for (int j = i + 1; j < c->chosen; j++) s -= c->L[(size_t)j * ld + (size_t)i] * c->s[j];
+        c->s[i] = s / c->L[(size_t)i * ld + (size_t)i];
+    }
+}
+
+// Takes out the cells whose weight has reached 0.
+static void tss__cub_drop(tss__cub *c) {
+    size_t ld = (size_t)c->most;
+    int to = 0;
+    for (int i = 0; i < c->chosen; i++) {
+        if (!(c->w[i] > 0)) {
+            c->out[c->in[i]] = 0;
+            continue;
+        }
+        // Rows and columns move up; what is read lies behind what is written.
+        for (int j = 0, at = 0; j <= i; j++) {
+            if (!(c->w[j] > 0)) continue;
+            c->A[(size_t)to * ld + (size_t)at++] = c->A[(size_t)i * ld + (size_t)j];
+        }
+        to++;
+    }
+    for (int i = 0, at = 0; i < c->chosen; i++)
+        if (c->w[i] > 0) c->in[at] = c->in[i], c->rhs[at] = c->rhs[i], c->w[at++] = c->w[i];
+    c->chosen = to;
+    for (int i = 0; i < to; i++) tss__cub_factor_row(c, i);
+}
+
+// Moves w to the least-squares weights as far as none turns negative, until they are reached.
+static void tss__cub_weights(tss__cub *c) {
+    for (;;) {
+        double t = 1;
+        int block = -1;
+        tss__cub_solve(c);
+        for (int i = 0; i < c->chosen; i++)
+            if (c->s[i] <= 0 && c->w[i] <= t * (c->w[i] - c->s[i]))
+                t = c->w[i] / (c->w[i] - c->s[i]), block = i;
+        for (int i = 0; i < c->chosen; i++) c->w[i] += t * (c->s[i] - c->w[i]);
+        if (block < 0) return;
+        c->w[block] = 0;
+        tss__cub_drop(c);
+    }
+}
+
+static double tss__cub_run(tss__cub *c, double tol) {
+    double all = sqrt(tss__dot_n((int)c->m, c->b, c->b)), error = all > 0 ? 1 : 0;
+    // A round may end with as many cells as before: the bound is for those.
+    for (int round = 0; round < 4 * c->most && c->chosen < c->most && error > tol; round++) {
+        int best = -1;
+        tss_parallel(c->host, (c->candidates + 63) / 64, tss__cub_match_task, c);
+        for (int k = 0; k < c->candidates; k++)
+            if (c->match[k] > 1e-12 * all && (best < 0 || c->match[k] > c->match[best])) best = k;
+        if (best < 0) break;                    // no cell would help: the optimum with w >= 0
+        if (!tss__cub_push(c, best)) continue;  // depends on the others: never tried again
+        tss__cub_weights(c);
+        if (!c->out[best])
+            c->out[best] = 1;  // left at once: rounding, and would come back for ever
+        tss__cub_residual(c);
+        error = sqrt(tss__dot_n((int)c->m, c->rest, c->rest)) / all;
+    }
+    return error;
+}
+
+typedef struct tss__cub_fill {  // one sample's rows of G
+    tss__cub *c;
+    const tss_elements *e;
+    const double *x;  // f(z), then its r derivatives
+    int r;
+    size_t n, first;
+    double scale;
+} tss__cub_fill;
+
+static void tss__cub_fill_task(int block, int worker, void *arg) {
+    (void)worker;
+    tss__cub_fill *f = (tss__cub_fill *)arg;
+    tss__cub *c = f->c;
+    const tss_elements *e = f->e;
+    int end = 64 * (block + 1) < c->candidates ? 64 * (block + 1) : c->candidates;
+    for (int k = 64 * block; k < end; k++) {
+        double F[9];
+        tss__n_cell q;
+        tss__n_jet t;
+        memset(&t, 0, sizeof t);
+        int cell = c->cell[k];
+        t.e = e, t.cell = e->cell, t.x = f->x, t.ld = f->n;
+        tss__jet_gather(&t, cell, 1, F);
+        tss__cell_at(&q, e->dim, e->mu[cell], e->la[cell], F);
+        for (int a = 0; a < f->r; a++) {
+            t.x = f->x + (size_t)(a + 1) * f->n;
+            tss__jet_gather(&t, cell, 1, F);
+            c->G[(size_t)k * c->m + f->first + (size_t)a] =
+                f->scale * e->vol[cell] * tss__dot_n(q.dd, q.P, F);
+        }
+    }
+}
+
+// b, G and norms. x: (1 + r)·n doubles, D: r² of them.
+static tss_result tss__cub_system(tss__cub *c, const tss_net *n, const tss_elements *e, tss_work *w,
+                                  int samples, const double *z, double *x, double *D) {
+    size_t r = (size_t)n->inputs, coords = (size_t)n->outputs;
+    tss_result result = tss_reduced_potential(n, e, w, samples, z, NULL, c->b, NULL);
+    tss__n_identity(D, (int)r);
+    for (size_t t = 0; result == TSS_OK && t < (size_t)samples; t++) {
+        double *b = c->b + t * r, size = sqrt(tss__dot_n((int)r, b, b));
+        tss__cub_fill f = {c, e, x, (int)r, coords, t * r, size > 0 ? 1 / size : 0};
+        for (size_t a = 0; a < r; a++) b[a] *= f.scale;
+        result = tss_net_jets(n, w, 1, (int)r, z + t * r, D, NULL, x, x + coords, NULL);
+        if (result == TSS_OK)
+            tss_parallel(&w->host, (c->candidates + 63) / 64, tss__cub_fill_task, &f);
+    }
+    for (int k = 0; result == TSS_OK && k < c->candidates; k++) {
+        const double *g = c->G + (size_t)k * c->m;
+        c->norm[k] = sqrt(tss__dot_n((int)c->m, g, g));
+        c->out[k] = !(c->norm[k] > 0);
+    }
+    memcpy(c->rest, c->b, c->m * sizeof(double));
+    return result;
+}
+
+// Draws the candidates: the head of a shuffle, in ascending order so that all cells need no
+// shuffle.
+static void tss__cub_draw(tss__cub *c, const tss_elements *e, uint64_t seed) {
+    tss_rng r = tss_rng_seed(seed);
+    int left = c->candidates, at = 0;
+    for (int k = 0; k < e->cells; k++)
+        if (tss_rng_uniform(&r) * (e->cells - k) < left) c->cell[at++] = k, left--;
+}
+
+static void tss__cub_carve(tss__cub *c, tss__n_slab *s, size_t r, size_t coords, double **x,
+                           double **D) {
+    double most = c->most, all = c->candidates;
+    c->G = tss__n_take(s, all, c->m), c->norm = tss__n_take(s, all, 1),
+    c->match = tss__n_take(s, all, 1);
+    c->b = tss__n_take(s, 1, c->m), c->rest = tss__n_take(s, 1, c->m);
+    c->A = tss__n_take(s, most, (size_t)c->most), c->L = tss__n_take(s, most, (size_t)c->most);
+    c->rhs = tss__n_take(s, most, 1), c->w = tss__n_take(s, most, 1),
+    c->s = tss__n_take(s, most, 1);
+    c->cell = (int *)(void *)tss__n_take(s, all, 1), c->in = (int *)(void *)tss__n_take(s, most, 1);
+    c->out = (uint8_t *)(void *)tss__n_take(s, all, 1);
+    *x = tss__n_take(s, (double)r + 1, coords), *D = tss__n_take(s, (double)r, r);
+}
+
+tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work *w,
+                               const tss_cubature_def *def, int samples, const double *z,
+                               int *subset, double *weight, int *count, double *error) {
+    *count = 0;
+    if (!tss__n_fits(n, e) || samples < 1 || def->count < 1 || def->candidates < 0 ||
+        !(def->tol >= 0) || (double)samples * n->inputs > 1e9)
+        return TSS_ERROR_BAD_ARGUMENT;
+    tss__cub c;
+    tss__n_slab s = {NULL, 0, 0};
+    double *x, *D;
+    size_t r = (size_t)n->inputs;
+    memset(&c, 0, sizeof c);
+    c.host = &w->host, c.m = (size_t)samples * r;
+    c.candidates = def->candidates && def->candidates < e->cells ? def->candidates : e->cells;
+    c.most = def->count < c.candidates ? def->count : c.candidates;
+    tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
+    if (s.want >= 1e15) return TSS_ERROR_NO_MEMORY;
+    // Memory of its own: the scratch of w is used by what is called.
+    size_t bytes = s.used * sizeof(double);
+    s.base = (double *)tss_alloc(&w->host, bytes);
+    if (!s.base) return TSS_ERROR_NO_MEMORY;
+    double *block = s.base;
+    s.used = 0, s.want = 0;
+    tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
+    tss__cub_draw(&c, e, def->seed);
+    tss_result result = tss__cub_system(&c, n, e, w, samples, z, x, D);
+    if (result == TSS_OK) {
+        double left = tss__cub_run(&c, def->tol);
+        if (error) *error = left;
+        for (int k = 0; k < c.candidates; k++) c.match[k] = 0;
+        for (int i = 0; i < c.chosen; i++) c.match[c.in[i]] = c.w[i];
+        for (int k = 0; k < c.candidates; k++)
+            if (c.match[k] > 0) subset[*count] = c.cell[k], weight[(*count)++] = c.match[k];
+    }
+    tss_free(&w->host, block, bytes);
+    return result;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>adam (private)
+// ---------------------------------------------------------------------------------------------
+
+struct tss_adam {
+    tss_host host;
+    tss_adam_def def;
+    uint64_t t;
+    double power1, power2;  // beta1^(t+1), beta2^(t+1), by products: saved as they are
+    size_t count;
+    double *m, *v;  // one block
+};
+
+tss_adam_def tss_adam_def_default(void) {
+    tss_adam_def d = {1e-3, 0.9, 0.999, 1e-8, 1, 0, 0};
+    return d;
+}
+
+static int tss__adam_valid(const tss_adam_def *d) {
+    return d->rate > 0 && d->rate < 1e300 && d->beta1 >= 0 && d->beta1 < 1 && d->beta2 >= 0 &&
+           d->beta2 < 1 && d->eps > 0 && d->eps < 1e300 && d->decay > 0 && d->decay < 1e300;
+}
+
+static void tss__adam_restart(tss_adam *a) {
+    tss__n_zero(a->m, 2 * a->count);
+    a->t = 0, a->power1 = a->def.beta1, a->power2 = a->def.beta2;
+}
+
+tss_result tss_adam_create(const tss_host *host, const tss_adam_def *def, size_t parameters,
+                           tss_adam **out) {
+    tss_host h = host ? *host : tss_host_default();
+    *out = NULL;
+    if (!tss__adam_valid(def) || parameters < 1) return TSS_ERROR_BAD_ARGUMENT;
+    if (parameters > (SIZE_MAX >> 5)) return TSS_ERROR_NO_MEMORY;
+    tss_adam *a = (tss_adam *)tss_alloc(&h, sizeof *a);
+    double *m = a ? (double *)tss_alloc(&h, 2 * parameters * sizeof(double)) : NULL;
+    if (!m) {
+        tss_free(&h, a, sizeof *a);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    a->host = h, a->def = *def, a->count = parameters, a->m = m, a->v = m + parameters;
+    tss__adam_restart(a);
+    *out = a;
+    return TSS_OK;
+}
+
+void tss_adam_destroy(tss_adam *a) {
+    if (!a) return;
+    tss_host h = a->host;
+    tss_free(&h, a->m, 2 * a->count * sizeof(double));
+    tss_free(&h, a, sizeof *a);
+}
+
+double tss_adam_rate(const tss_adam *a) {
+    double rate = a->def.rate;
+    if (a->def.decay_every) rate *= pow(a->def.decay, (double)(a->t / a->def.decay_every));
+    if (a->t < a->def.warmup) rate *= (double)(a->t + 1) / (double)a->def.warmup;
+    return rate;
+}
+
+uint64_t tss_adam_steps(const tss_adam *a) { return a->t; }
+
+void tss_adam_update(tss_adam *a, size_t first, size_t count, double *theta, const double *g) {
+    TSS_ASSERT(first <= a->count && count <= a->count - first);
+    double b1 = a->def.beta1, b2 = a->def.beta2, rate = tss_adam_rate(a);
+    double c1 = 1 / (1 - a->power1), c2 = 1 / (1 - a->power2);
+    double *m = a->m + first, *v = a->v + first;
+    for (size_t i = 0; i < count; i++) {
+        m[i] = b1 * m[i] + (1 - b1) * g[i];
+        v[i] = b2 * v[i] + (1 - b2) * g[i] * g[i];
+        theta[i] -= rate * (c1 * m[i]) / (sqrt(c2 * v[i]) + a->def.eps);
+    }
+}
+
+void tss_adam_advance(tss_adam *a) { a->t++, a->power1 *= a->def.beta1, a->power2 *= a->def.beta2; }
+
+tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restart) {
+    if (!tss__adam_valid(def)) return TSS_ERROR_BAD_ARGUMENT;
+    int same = def->beta1 == a->def.beta1 && def->beta2 == a->def.beta2;
+    if (!same && !restart) return TSS_ERROR_BAD_ARGUMENT;  // moments of other betas mean nothing
+    a->def = *def;
+    if (restart) tss__adam_restart(a);
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>models (private)
+// Everything is a 64-bit number, little-endian: integers and IEEE doubles. docs/neural.md has the
+// table.
+// ---------------------------------------------------------------------------------------------
+
+#define TSS__MODEL_MAGIC 0x0A5255454E737374u  // "tssNEUR\n"
+#define TSS__MODEL_VERSION 1u
+#define TSS__MODEL_HEAD 4  // magic, version, bytes, checksum
+
+typedef struct tss__n_out {  // p NULL: counting
+    unsigned char *p;
+    size_t at;
+} tss__n_out;
+
+static void tss__put(tss__n_out *o, uint64_t x) {
+    for (int k = 0; o->p && k < 8; k++) o->p[o->at + (size_t)k] = (unsigned char)(x >> (8 * k));
+    o->at += 8;
+}
+
+static void tss__put_doubles(tss__n_out *o, const double *x, size_t count) {
+    for (size_t i = 0; i < count; i++) {
+        uint64_t bits;
+        memcpy(&bits, x + i, 8);
+        tss__put(o, bits);
+    }
+}
+
+static uint64_t tss__get_at(const unsigned char *p) {
+    uint64_t x = 0;
+    for (int k = 0; k < 8; k++) x |= (uint64_t)p[k] << (8 * k);
+    return x;
+}
+
+// FNV-1a of all bytes but the checksum itself: a change of one byte always changes it.
+static uint64_t tss__model_sum(const unsigned char *p, size_t size) {
+    uint64_t h = 14695981039346656037u;
+    for (size_t i = 0; i < size; i++)
+        if (i < 24 || i >= 32) h = (h ^ p[i]) * 1099511628211u;
+    return h;
+}
+
+static void tss__put_net(tss__n_out *o, const tss_net *n) {
+    size_t part[5], all = tss__net_parts(n, part);
+    tss__put(o, (uint64_t)n->layers), tss__put(o, (uint64_t)n->activation);
+    tss__put(o, (uint64_t)n->has_in), tss__put(o, (uint64_t)n->map);
+    tss__put(o, (uint64_t)n->inputs), tss__put(o, (uint64_t)n->outputs);
+    tss__put_doubles(o, &n->scale, 1);
+    for (int l = 0; l <= n->layers; l++) tss__put(o, (uint64_t)n->width[l]);
+    tss__put_doubles(o, n->p, all);
+    for (int i = 0; n->from && i < n->outputs; i++) tss__put(o, (uint64_t)(n->from[i] + 1));
+}
+
+static void tss__put_adam(tss__n_out *o, const tss_adam *a) {
+    const double d[7] = {a->def.rate,  a->def.beta1, a->def.beta2, a->def.eps,
+                         a->def.decay, a->power1,    a->power2};
+    tss__put_doubles(o, d, 7);
+    tss__put(o, a->def.decay_every), tss__put(o, a->def.warmup), tss__put(o, a->t);
+    tss__put(o, a->count);
+    tss__put_doubles(o, a->m, 2 * a->count);
+}
+
+static size_t tss__put_model(const tss_model *m, unsigned char *data, uint64_t bytes) {
+    tss__n_out o = {data, 0};
+    tss__put(&o, TSS__MODEL_MAGIC), tss__put(&o, TSS__MODEL_VERSION), tss__put(&o, bytes);
+    tss__put(&o, 0);
+    tss__put(&o, (m->encoder ? 1u : 0u) | (m->adam ? 2u : 0u));
+    tss__put(&o, m->step);
+    for (int k = 0; k < 4; k++) tss__put(&o, m->rng.s[k]);
+    tss__put_net(&o, m->decoder);
+    if (m->encoder) tss__put_net(&o, m->encoder);
+    if (m->adam) tss__put_adam(&o, m->adam);
+    return o.at;
+}
+
+size_t tss_model_save(const tss_model *m, void *data, size_t size) {
+    if (!m->decoder) return 0;
+    size_t need = tss__put_model(m, NULL, 0);
+    if (!data) return need;
+    if (size < need) return 0;
+    unsigned char *p = (unsigned char *)data;
+    tss__put_model(m, p, need);
+    tss__n_out at = {p, 24};
+    tss__put(&at, tss__model_sum(p, need));
+    return need;
+}
+
+void tss_model_free(tss_model *m) {
+    tss_net_destroy(m->decoder), tss_net_destroy(m->encoder), tss_adam_destroy(m->adam);
+    memset(m, 0, sizeof *m);
+}
+
+typedef struct tss__n_in {
+    const unsigned char *p;
+    size_t at, size;
+    tss_result result;  // the first error stays
+    char *why;
+    size_t why_size;
+} tss__n_in;
+
+static int tss__in_fail(tss__n_in *in, tss_result r, const char *text) {
+    if (in->result == TSS_OK && in->why && in->why_size)
+        snprintf(in->why, in->why_size, "%s (at byte %zu of %zu)", text, in->at, in->size);
+    if (in->result == TSS_OK) in->result = r;
+    return 0;
+}
+
+static uint64_t tss__get(tss__n_in *in) {
+    if (in->size - in->at < 8) {
+        tss__in_fail(in, TSS_ERROR_FORMAT, "the file ends too early");
+        return 0;
+    }
+    in->at += 8;
+    return tss__get_at(in->p + in->at - 8);
+}
+
+// A number that must lie in lo..hi.
+static int tss__get_int(tss__n_in *in, uint64_t lo, uint64_t hi, const char *what) {
+    uint64_t x = tss__get(in);
+    char text[96];
+    if (x >= lo && x <= hi) return (int)x;
+    snprintf(text, sizeof text, "%s is %llu, outside %llu..%llu", what, (unsigned long long)x,
+             (unsigned long long)lo, (unsigned long long)hi);
+    tss__in_fail(in, TSS_ERROR_FORMAT, text);
+    return (int)lo;
+}
+
+static int tss__get_doubles(tss__n_in *in, double *x, size_t count, const char *what) {
+    char text[96];
+    for (size_t i = 0; i < count; i++) {
+        uint64_t bits = tss__get(in);
+        memcpy(x + i, &bits, 8);
+        if (isfinite(x[i])) continue;
+        snprintf(text, sizeof text, "%s holds a number that is not finite", what);
+        return tss__in_fail(in, TSS_ERROR_FORMAT, text);
+    }
+    return in->result == TSS_OK;
+}
+
+// Are there `count` more numbers?
+static int tss__in_has(tss__n_in *in, double count, const char *what) {
+    char text[96];
+    if (count * 8 <= (double)(in->size - in->at)) return 1;
+    snprintf(text, sizeof text, "%s needs %.0f numbers, more than the file has left", what, count);
+    return tss__in_fail(in, TSS_ERROR_FORMAT, text);
+}
+
+static void tss__get_net_sizes(tss__n_in *in, tss_net *n) {
+    n->layers = tss__get_int(in, 1, TSS__NET_LAYERS, "the number of layers");
+    n->activation = (tss_activation)tss__get_int(in, 0, TSS_ACTIVATIONS - 1, "the activation");
+    n->has_in = tss__get_int(in, 0, 1, "the flag of the first map");
+    n->map = tss__get_int(in, 0, 2, "the kind of the last map");
+    n->inputs = tss__get_int(in, 1, 1 << 28, "the number of inputs");
+    n->outputs = tss__get_int(in, 1, 1 << 28, "the number of outputs");
+    tss__get_doubles(in, &n->scale, 1, "the scale");
+    for (int l = 0; l <= n->layers; l++) n->width[l] = tss__get_int(in, 1, 1 << 26, "a width");
+    if (in->result != TSS_OK) return;
+    if ((!n->has_in && n->inputs != n->width[0]) ||
+        (n->map == TSS__MAP_NONE && n->outputs != n->width[n->layers]))
+        tss__in_fail(in, TSS_ERROR_FORMAT, "inputs or outputs do not fit the widths");
+}
+
+// Numbers that a net of these sizes has in the file, in doubles: no overflow.
+static double tss__net_numbers(const tss_net *n) {
+    double s = 0, out = n->map ? n->outputs : 0, in = n->has_in ? n->inputs : 0;
+    for (int l = 0; l < n->layers; l++) s += ((double)n->width[l] + 1) * n->width[l + 1];
+    s += in * (1.0 + n->width[0]);
+    return s + out * (n->map == TSS__MAP_MATRIX ? 1.0 + n->width[n->layers] : 2.0);
+}
+
+static tss_net *tss__get_net(tss__n_in *in, const tss_host *h, const char *name) {
+    tss_net *n = (tss_net *)tss_alloc(h, sizeof *n);
+    if (!n) {
+        tss__in_fail(in, TSS_ERROR_NO_MEMORY, "no memory for a network");
+        return NULL;
+    }
+    memset(n, 0, sizeof *n);
+    n->host = *h;
+    tss__get_net_sizes(in, n);
+    if (in->result == TSS_OK && tss__in_has(in, tss__net_numbers(n), name)) {
+        size_t part[5];
+        tss__net_layout(n);
+        if (!tss__net_arrays(n))
+            tss__in_fail(in, TSS_ERROR_NO_MEMORY, "no memory for a network");
+        else
+            tss__get_doubles(in, n->p, tss__net_parts(n, part), name);
+    }
+    for (int i = 0; in->result == TSS_OK && n->from && i < n->outputs; i++)
+        n->from[i] =
+            tss__get_int(in, 0, (uint64_t)n->width[n->layers], "an output's coordinate") - 1;
+    if (in->result == TSS_OK) return n;
+    tss_net_destroy(n);
+    return NULL;
+}
+
+static tss_adam *tss__get_adam(tss__n_in *in, const tss_host *h, size_t parameters) {
+    tss_adam_def def;
+    tss_adam *a = NULL;
+    double d[7];
+    uint64_t t, count;
+    if (!tss__get_doubles(in, d, 7, "the optimiser")) return NULL;
+    def.rate = d[0], def.beta1 = d[1], def.beta2 = d[2], def.eps = d[3], def.decay = d[4];
+    def.decay_every = tss__get(in), def.warmup = tss__get(in), t = tss__get(in),
+    count = tss__get(in);
+    int powers = d[5] >= 0 && d[5] < 1 && d[6] >= 0 && d[6] < 1;
+    if (!tss__adam_valid(&def) || !powers || count != parameters)
+        tss__in_fail(in, TSS_ERROR_FORMAT, "the optimiser does not fit the networks");
+    else if (tss__in_has(in, 2.0 * (double)count, "the optimiser") &&
+             tss_adam_create(h, &def, parameters, &a) != TSS_OK)
+        tss__in_fail(in, TSS_ERROR_NO_MEMORY, "no memory for the optimiser");
+    if (!a) return NULL;
+    a->t = t, a->power1 = d[5], a->power2 = d[6];
+    tss__get_doubles(in, a->m, 2 * parameters, "the optimiser");
+    for (size_t i = 0; i < parameters; i++)
+        if (!(a->v[i] >= 0)) tss__in_fail(in, TSS_ERROR_FORMAT, "a second moment is negative");
+    return a;
+}
+
+static void tss__get_head(tss__n_in *in) {
+    if (in->size < 80 || tss__get(in) != TSS__MODEL_MAGIC) {
+        in->at = 0;
+        tss__in_fail(in, TSS_ERROR_FORMAT, "not a tss_neural file");
+        return;
+    }
+    char text[96];
+    uint64_t version = tss__get(in), bytes = tss__get(in), sum = tss__get(in);
+    if (version != TSS__MODEL_VERSION)
+        snprintf(text, sizeof text, "version %llu, this library reads version %u",
+                 (unsigned long long)version, TSS__MODEL_VERSION);
+    else if (bytes != in->size)
+        snprintf(text, sizeof text, "the file should have %llu bytes: cut short or damaged",
+                 (unsigned long long)bytes);
+    else if (sum != tss__model_sum(in->p, in->size))
+        snprintf(text, sizeof text, "the checksum is wrong: the file is damaged");
+    else
+        return;
+    tss__in_fail(in, TSS_ERROR_FORMAT, text);
+}
+
+static void tss__get_model(tss__n_in *in, const tss_host *h, tss_model *m) {
+    int parts = tss__get_int(in, 0, 3, "the list of parts");
+    m->step = tss__get(in);
+    for (int k = 0; k < 4; k++) m->rng.s[k] = tss__get(in);
+    m->decoder = tss__get_net(in, h, "the decoder");
+    if (in->result == TSS_OK && (parts & 1)) m->encoder = tss__get_net(in, h, "the encoder");
+    if (in->result != TSS_OK) return;
+    size_t count = m->decoder->theta[m->decoder->layers];
+    if (m->encoder) count += m->encoder->theta[m->encoder->layers];
+    if (parts & 2) m->adam = tss__get_adam(in, h, count);
+    if (in->result == TSS_OK && in->at != in->size)
+        tss__in_fail(in, TSS_ERROR_FORMAT, "there are bytes behind the end");
+    if (in->result == TSS_OK && m->encoder &&
+        (m->encoder->outputs != m->decoder->inputs || m->encoder->inputs != m->decoder->outputs))
+        tss__in_fail(in, TSS_ERROR_FORMAT, "encoder and decoder do not fit each other");
+}
+
+tss_result tss_model_load(const tss_host *host, const void *data, size_t size, tss_model *out,
+                          char *why, size_t why_size) {
+    tss_host h = host ? *host : tss_host_default();
+    tss__n_in in = {(const unsigned char *)data, 0, size, TSS_OK, why, why_size};
+    memset(out, 0, sizeof *out);
+    if (why && why_size) why[0] = 0;
+    tss__get_head(&in);
+    if (in.result == TSS_OK) tss__get_model(&in, &h, out);
+    if (in.result != TSS_OK) tss_model_free(out);
+    return in.result;
+}
+
+static tss_result tss__model_store(const char *path, const char *part, const void *data,
+                                   size_t size) {
+    FILE *f = fopen(part, "wb");
+    if (!f) return TSS_ERROR_FILE;
+    size_t done = fwrite(data, 1, size, f);
+    int bad = fclose(f) != 0 || done != size;
+    if (!bad && rename(part, path) == 0) return TSS_OK;
+    remove(part);
+    return TSS_ERROR_FILE;
+}
+
+tss_result tss_model_write(const tss_host *host, const tss_model *m, const char *path) {
+    tss_host h = host ? *host : tss_host_default();
+    size_t size = tss_model_save(m, NULL, 0), name = strlen(path) + 6;
+    if (!size) return TSS_ERROR_BAD_ARGUMENT;
+    tss_result r = TSS_ERROR_NO_MEMORY;
+    void *data = tss_alloc(&h, size);
+    char *part = (char *)tss_alloc(&h, name);
+    if (data && part) {
+        snprintf(part, name, "%s.part", path);
+        tss_model_save(m, data, size);
+        r = tss__model_store(path, part, data, size);
+    }
+    tss_free(&h, data, size), tss_free(&h, part, name);
+    return r;
+}
+
+// The file's bytes in memory of the host, room: what to free. Grows as it reads: the size that a
+// file system reports is not believed either.
+static tss_result tss__model_fetch(const tss_host *h, const char *path, unsigned char **data,
+                                   size_t *size, size_t *room) {
+    FILE *f = fopen(path, "rb");
+    tss_result r = f ? TSS_OK : TSS_ERROR_FILE;
+    *data = NULL, *size = *room = 0;
+    while (r == TSS_OK) {
+        size_t more = *room ? 2 * *room : 65536, got;
+        unsigned char *p = (unsigned char *)tss_alloc(h, more);
+        if (!p) {
+            r = TSS_ERROR_NO_MEMORY;
+            break;
+        }
+        if (*size) memcpy(p, *data, *size);
+        tss_free(h, *data, *room);
+        *data = p, *room = more;
+        got = fread(p + *size, 1, more - *size, f);
+        *size += got;
+        if (ferror(f)) r = TSS_ERROR_FILE;
+        if (*size < more) break;
+    }
+    if (f) fclose(f);
+    return r;
+}
+
+tss_result tss_model_read(const tss_host *host, const char *path, tss_model *out, char *why,
+                          size_t why_size) {
+    tss_host h = host ? *host : tss_host_default();
+    unsigned char *data;
+    size_t size, room;
+    memset(out, 0, sizeof *out);
+    tss_result r = tss__model_fetch(&h, path, &data, &size, &room);
+    if (r != TSS_OK && why && why_size) snprintf(why, why_size, "%s: %s", path, tss_result_text(r));
+    if (r == TSS_OK) r = tss_model_load(&h, data, size, out, why, why_size);
+    tss_free(&h, data, room);
+    return r;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>training (private)
+// ---------------------------------------------------------------------------------------------
+
+#define TSS__TRAINING_COOKIE 0x747261
+
+struct tss_training {
+    tss_host host;
+    tss_training_def def;
+    tss_work *work;
+    size_t dec, enc;  // parameters
+    double *p;        // one block
+    size_t bytes;
+    double *g, *x, *z, *z_bar, *probe;  // gradients; a batch of frames; of z
+};
+
+tss_training_def tss_training_def_default(void) {
+    tss_training_def d;
+    memset(&d, 0, sizeof d);
+    d.batch = 32, d.lambda = d.sigma = 1, d.eps = 1e-8, d.lipschitz_batch = 16,
+    d.through_encoder = 1;
+    d.lipschitz = tss_lipschitz_def_default(), d.adam = tss_adam_def_default();
+    d.cookie = TSS__TRAINING_COOKIE;
+    return d;
+}
+
+static const char *tss__training_complaint(const tss_training_def *d) {
+    const tss_model *m = d->model;
+    if (!m || !m->decoder) return "training: no decoder";
+    const tss_net *dec = m->decoder, *enc = m->encoder;
+    int lip = d->lipschitz_weight != 0;
+    if (enc && (enc->outputs != dec->inputs || enc->inputs != dec->outputs))
+        return "training: encoder and decoder do not fit each other";
+    if (enc && (!d->frames || d->frame_count < 1)) return "training: an encoder, but no frames";
+    if (!enc && (!d->elements || d->batch < 2))
+        return "training: unsupervised needs elements and a batch of 2";
+    if (d->batch < 1 || d->batch > (1 << 20) || d->lipschitz_batch > (1 << 20))
+        return "training: batch out of range";
+    if ((d->elements && !tss__n_fits(dec, d->elements)) ||
+        (d->cubature && !tss__n_fits(dec, d->cubature)))
+        return "training: elements and decoder have different coordinates";
+    if (!(d->sigma > 0) || !(d->eps >= 0) || !isfinite(d->lambda))
+        return "training: sigma, eps or lambda out of range";
+    if (!(d->lipschitz_weight >= 0 && d->lipschitz_weight < 1e300))
+        return "training: lipschitz_weight out of range";
+    if (lip && !d->elements && !d->cubature) return "training: the Lipschitz loss needs elements";
+    if (lip && !tss__lip_valid(dec, d->cubature ? d->cubature : d->elements, &d->lipschitz,
+                               d->lipschitz_batch, d->frames ? d->frames : &d->sigma))
+        return "training: the Lipschitz loss is out of range";
+    if (!tss__adam_valid(&d->adam)) return "training: Adam out of range";
+    if (m->adam && m->adam->count != dec->theta[dec->layers] + (enc ? enc->theta[enc->layers] : 0))
+        return "training: the optimiser does not fit the networks";
+    if (d->ramp && dec->map != TSS__MAP_SCATTER)
+        return "training: ramp needs a decoder with out_scale";
+    return NULL;
+}
+
+void tss_training_destroy(tss_training *t) {
+    if (!t) return;
+    tss_host h = t->host;
+    tss_work_destroy(t->work);
+    tss_free(&h, t->p, t->bytes);
+    tss_free(&h, t, sizeof *t);
+}
+
+static int tss__training_arrays(tss_training *t) {
+    const tss_net *dec = t->def.model->decoder, *enc = t->def.model->encoder;
+    int most = t->def.batch > t->def.lipschitz_batch ? t->def.batch : t->def.lipschitz_batch;
+    size_t rows = (size_t)most, r = (size_t)dec->inputs, n = enc ? (size_t)dec->outputs : 0;
+    t->dec = dec->theta[dec->layers], t->enc = enc ? enc->theta[enc->layers] : 0;
+    t->bytes = (t->dec + t->enc + rows * (n + 2 * r) + 2 * r * r) * sizeof(double);
+    t->p = (double *)tss_alloc(&t->host, t->bytes);
+    if (!t->p) return 0;
+    t->g = t->p, t->x = t->g + t->dec + t->enc, t->z = t->x + rows * n, t->z_bar = t->z + rows * r;
+    t->probe = t->z_bar + rows * r;
+    return tss_work_create(&t->host, &t->work) == TSS_OK &&
+           (t->def.model->adam || tss_adam_create(&t->host, &t->def.adam, t->dec + t->enc,
+                                                  &t->def.model->adam) == TSS_OK);
+}
+
+tss_result tss_training_create(const tss_host *host, const tss_training_def *def,
+                               tss_training **out) {
+    tss_host h = host ? *host : tss_host_default();
+    *out = NULL;
+    TSS_ASSERT(def->cookie == TSS__TRAINING_COOKIE && "tss_training_def: start from the default");
+    const char *wrong = tss__training_complaint(def);
+    if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss_training *t = (tss_training *)tss_alloc(&h, sizeof *t);
+    if (!t) return TSS_ERROR_NO_MEMORY;
+    memset(t, 0, sizeof *t);
+    t->host = h, t->def = *def;
+    if (!tss__training_arrays(t)) {
+        tss_training_destroy(t);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    const uint64_t *s = def->model->rng.s;
+    if (!(s[0] | s[1] | s[2] | s[3])) def->model->rng = tss_rng_seed(0);  // zeros would stay zeros
+    *out = t;
+    return TSS_OK;
+}
+
+static void tss__training_frames(tss_training *t, int count) {
+    size_t n = (size_t)t->def.model->decoder->outputs;
+    for (int i = 0; i < count; i++) {
+        size_t f = (size_t)(tss_rng_uniform(&t->def.model->rng) * t->def.frame_count);
+        memcpy(t->x + (size_t)i * n, t->def.frames + f * n, n * sizeof(double));
+    }
+}
+
+static void tss__training_normals(tss_training *t, double *to, int count) {
+    for (int i = 0; i < count * t->def.model->decoder->inputs; i++)
+        to[i] = tss_rng_normal(&t->def.model->rng);
+}
+
+static tss_result tss__training_vanilla(tss_training *t, double ramp, tss_training_info *info) {
+    const tss_training_def *d = &t->def;
+    const tss_model *m = d->model;
+    if (m->encoder) {
+        tss__training_frames(t, d->batch);
+        return tss_loss_reconstruction(m->decoder, m->encoder, t->work, d->mass, d->batch, t->x, 1,
+                                       &info->loss, t->g, t->g + t->dec);
+    }
+    tss__training_normals(t, t->z, d->batch);
+    return tss_loss_unsupervised(m->decoder, d->elements, t->work, d->mass, d->lambda,
+                                 d->sigma * ramp, d->eps, d->batch, t->z, 1, &info->loss,
+                                 info->parts, t->g);
+}
+
+// λ_LS L_LS on samples of the pull-back distribution (§4.2): encoded frames, or N(0, 1).
+static tss_result tss__training_lipschitz(tss_training *t, tss_training_info *info) {
+    const tss_training_def *d = &t->def;
+    const tss_model *m = d->model;
+    int B = d->lipschitz_batch, r = m->decoder->inputs;
+    double *probe = d->lipschitz.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe;
+    double *z_bar = m->encoder && d->through_encoder ? t->z_bar : NULL;
+    tss_result result = TSS_OK;
+    if (m->encoder) {
+        tss__training_frames(t, B);
+        result = tss_net_forward(m->encoder, t->work, B, t->x, t->z);
+    } else {
+        tss__training_normals(t, t->z, B);
+    }
+    if (probe) tss__training_normals(t, probe, 2 * d->lipschitz.probes);
+    if (z_bar) tss__n_zero(z_bar, (size_t)(B * r));
+    if (result == TSS_OK)
+        result = tss_loss_lipschitz(m->decoder, d->cubature ? d->cubature : d->elements, t->work,
+                                    &d->lipschitz, B, t->z, probe, d->lipschitz_weight,
+                                    &info->lipschitz, t->g, z_bar);
+    if (result == TSS_OK && z_bar)
+        result = tss_net_backward(m->encoder, t->work, B, t->x, z_bar, t->g + t->dec, NULL);
+    return result;
+}
+
+tss_result tss_training_step(tss_training *t, tss_training_info *out) {
+    const tss_training_def *d = &t->def;
+    tss_model *m = d->model;
+    tss_training_info info;
+    tss_rng before = m->rng;
+    double ramp = 1;
+    memset(&info, 0, sizeof info);
+    if (m->step < d->ramp) ramp = (double)(m->step + 1) / (double)d->ramp;
+    if (d->ramp) tss_net_set_scale(m->decoder, ramp);
+    tss__n_zero(t->g, t->dec + t->enc);
+    tss_result r = tss__training_vanilla(t, ramp, &info);
+    if (r == TSS_OK && d->lipschitz_weight > 0 && m->step >= d->lipschitz_from)
+        r = tss__training_lipschitz(t, &info);
+    if (r != TSS_OK) {  // as if it had not been called
+        m->rng = before;
+        return r;
+    }
+    for (size_t i = 0; i < t->dec + t->enc; i++) info.skipped |= !isfinite(t->g[i]);
+    info.rate = tss_adam_rate(m->adam);
+    if (!info.skipped) {
+        tss_adam_update(m->adam, 0, t->dec, m->decoder->par, t->g);
+        if (m->encoder) tss_adam_update(m->adam, t->dec, t->enc, m->encoder->par, t->g + t->dec);
+        tss_adam_advance(m->adam);
+    }
+    m->step++;
+    if (out) *out = info;
+    return TSS_OK;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>reduced_solver (private)
+// ---------------------------------------------------------------------------------------------
+
+#define TSS__REDUCED_COOKIE 0x726564
+
+struct tss_reduced {
+    tss_host host;
+    tss_reduced_def def;
+    tss_work *work;
+    tss__n_reduced job;
+    int r, pairs, newest;  // pairs kept of the L-BFGS history
+    size_t n;
+    double *p;  // one block
+    size_t bytes;
+    double *z, *z_last, *x, *x_last, *q, *force;           // state; x_last: x_{t−1}
+    double *S, *Y, *curve, *part, *g, *g_new, *d, *z_new;  // S, Y: memory × r
+    double energy;
+    int evaluations, current;  // 1: the last evaluation was at z
+    uint64_t exits[TSS_EXITS];
+};
+
+tss_reduced_def tss_reduced_def_default(void) {
+    tss_reduced_def d;
+    memset(&d, 0, sizeof d);
+    d.h = 0.05, d.eps = 1e-5, d.ftol = 2.2e-9, d.memory = 10, d.max_line = 128,
+    d.max_iterations = 1024;
+    d.cookie = TSS__REDUCED_COOKIE;
+    return d;
+}
+
+static const char *tss__reduced_complaint(const tss_reduced_def *d) {
+    if (!d->decoder || !d->elements || !tss__n_fits(d->decoder, d->elements))
+        return "reduced solver: decoder and elements do not fit each other";
+    if (!(d->h >= 0 && d->h < 1e300)) return "reduced solver: h must be >= 0";
+    if (d->h > 0 && !d->mass) return "reduced solver: dynamics need masses";
+    if (!(d->eps >= 0) || !(d->ftol >= 0)) return "reduced solver: a tolerance is negative";
+    if (d->memory < 1 || d->memory > 64 || d->max_line < 1 || d->max_iterations < 0)
+        return "reduced solver: memory, max_line or max_iterations out of range";
+    return NULL;
+}
+
+void tss_reduced_destroy(tss_reduced *s) {
+    if (!s) return;
+    tss_host h = s->host;
+    tss_work_destroy(s->work);
+    tss_free(&h, s->p, s->bytes);
+    tss_free(&h, s, sizeof *s);
+}
+
+static void tss__reduced_carve(tss_reduced *s, tss__n_slab *b) {
+    size_t r = (size_t)s->r, n = s->n;
+    double **small[6] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new};
+    double **large[4] = {&s->x, &s->x_last, &s->q, &s->force};
+    for (int k = 0; k < 6; k++) *small[k] = tss__n_take(b, 1, r);
+    for (int k = 0; k < 4; k++) *large[k] = tss__n_take(b, 1, n);
+    s->S = tss__n_take(b, s->def.memory, r), s->Y = tss__n_take(b, s->def.memory, r);
+    s->curve = tss__n_take(b, s->def.memory, 1), s->part = tss__n_take(b, s->def.memory, 1);
+}
+
+static int tss__reduced_arrays(tss_reduced *s) {
+    tss__n_slab b = {NULL, 0, 0}, pass = {NULL, 0, 0};
+    tss__reduced_carve(s, &b);
+    if (b.want >= 1e15 || tss_work_create(&s->host, &s->work) != TSS_OK) return 0;
+    s->bytes = b.used * sizeof(double);
+    s->p = (double *)tss_alloc(&s->host, s->bytes);
+    if (!s->p) return 0;
+    tss__n_zero(s->p, b.used);
+    b.base = s->p, b.used = 0;
+    tss__reduced_carve(s, &b);
+    tss__reduced_init(&s->job, s->def.decoder, s->def.elements, TSS__CELL_REVERSE, 1, 0, NULL);
+    s->job.p.dof = NULL, s->job.p.coords = s->n;
+    tss__reduced_plan(&s->job, &pass, 0);
+    if (!tss__n_room(s->work, &pass)) return 0;
+    tss__reduced_plan(&s->job, &pass, 0);
+    return 1;
+}
+
+tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def, tss_reduced **out) {
+    tss_host h = host ? *host : tss_host_default();
+    *out = NULL;
+    TSS_ASSERT(def->cookie == TSS__REDUCED_COOKIE && "tss_reduced_def: start from the default");
+    const char *wrong = tss__reduced_complaint(def);
+    if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss_reduced *s = (tss_reduced *)tss_alloc(&h, sizeof *s);
+    if (!s) return TSS_ERROR_NO_MEMORY;
+    memset(s, 0, sizeof *s);
+    s->host = h, s->def = *def, s->r = def->decoder->inputs, s->n = (size_t)def->decoder->outputs;
+    if (!tss__reduced_arrays(s)) {
+        tss_reduced_destroy(s);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    tss_reduced_set(s, def->start ? def->start : s->z);
+    *out = s;
+    return TSS_OK;
+}
+
+// E at z; its gradient to g, f(z) is left in the job's x.
+static double tss__reduced_energy(tss_reduced *s, const double *z, double *g) {
+    tss__n_reduced *j = &s->job;
+    const tss__jetpass *p = &j->p;
+    double P, E, half = s->def.h > 0 ? 0.5 / (s->def.h * s->def.h) : 0;
+    j->z = z, j->P = &P;
+    s->evaluations++;
+    tss__jetpass_load(p, 0, z, NULL, 0), tss__jetpass_forward(p, 0), tss__jetpass_out(p, 0);
+    tss__reduced_elements(j, 0);
+    E = P;
+    for (size_t i = 0; i < s->n; i++) {
+        double gap = p->x[i] - s->q[i], m = half > 0 ? half * s->def.mass[i] : 0;
+        E += m * gap * gap - s->force[i] * p->x[i];
+        p->xbar[i] += 2 * m * gap - s->force[i];
+    }
+    tss__jetpass_in_bar(p, 0, p->xbar);
+    memcpy(g, tss__jetpass_backward(p, 0, 0), (size_t)s->r * sizeof(double));
+    return E;
+}
+
+tss_result tss_reduced_set(tss_reduced *s, const double *z) {
+    for (int i = 0; i < s->r; i++)
+        if (!isfinite(z[i])) return TSS_ERROR_BAD_STATE;
+    if (z != s->z) memcpy(s->z, z, (size_t)s->r * sizeof(double));
+    memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
+    tss__reduced_energy(s, s->z, s->g);
+    memcpy(s->x, s->job.p.x, s->n * sizeof(double));
+    memcpy(s->x_last, s->x, s->n * sizeof(double));
+    return TSS_OK;
+}
+
+void tss_reduced_set_force(tss_reduced *s, const double *force) {
+    if (force)
+        memcpy(s->force, force, s->n * sizeof(double));
+    else
+        tss__n_zero(s->force, s->n);
+}
+
+const double *tss_reduced_z(const tss_reduced *s) { return s->z; }
+const double *tss_reduced_x(const tss_reduced *s) { return s->x; }
+const uint64_t *tss_reduced_exits(const tss_reduced *s) { return s->exits; }
+
+// d = −H g by the two loops over the history (Nocedal and Wright, algorithm 7.4).
+static void tss__reduced_direction(tss_reduced *s) {
+    int r = s->r, M = s->def.memory;
+    for (int i = 0; i < r; i++) s->d[i] = -s->g[i];
+    for (int k = 0; k < s->pairs; k++) {
+        int at = (s->newest + M - k) % M;
+        s->part[at] = tss__dot_n(r, s->S + at * r, s->d) / s->curve[at];
+        for (int i = 0; i < r; i++) s->d[i] -= s->part[at] * s->Y[at * r + i];
+    }
+    double scale = 1, size = sqrt(tss__dot_n(r, s->g, s->g));
+    if (s->pairs) {
+        const double *y = s->Y + s->newest * r;
+        scale = s->curve[s->newest] / tss__dot_n(r, y, y);
+    } else if (size > 1) {
+        scale = 1 / size;  // the first step moves by 1 at most
+    }
+    for (int i = 0; i < r; i++) s->d[i] *= scale;
+    for (int k = s->pairs - 1; k >= 0; k--) {
+        int at = (s->newest + M - k) % M;
+        double b = tss__dot_n(r, s->Y + at * r, s->d) / s->curve[at];
+        for (int i = 0; i < r; i++) s->d[i] += (s->part[at] - b) * s->S[at * r + i];
+    }
+}
+
+// Keeps the pair of the step z → z_new if its curvature is safely positive.
+static void tss__reduced_learn(tss_reduced *s) {
+    int r = s->r, M = s->def.memory, at = (s->newest + 1) % M;
+    double *S = s->S + at * r, *Y = s->Y + at * r;
+    // Written over the oldest: that one is given up even if the new one is not kept.
+    if (s->pairs == M) s->pairs--;
+    for (int i = 0; i < r; i++) S[i] = s->z_new[i] - s->z[i], Y[i] = s->g_new[i] - s->g[i];
+    double sy = tss__dot_n(r, S, Y), ss = tss__dot_n(r, S, S), yy = tss__dot_n(r, Y, Y);
+    if (!(sy > 1e-12 * sqrt(ss) * sqrt(yy))) return;
+    s->curve[at] = sy, s->newest = at, s->pairs++;
+}
+
+// Backtracking (c1 = 1e-4, factor 0.8, as the paper's code) along d. 1: z_new, g_new, *E are
+// better. Where E itself is rounding, the slope decides (Hager and Zhang's approximate condition,
+// the same on a parabola).
+static int tss__reduced_line(tss_reduced *s, double *E) {
+    double t = 1, slope = tss__dot_n(s->r, s->g, s->d);
+    for (int k = 0; k < s->def.max_line; k++, t *= 0.8) {
+        for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
+        *E = tss__reduced_energy(s, s->z_new, s->g_new);
+        if (!isfinite(*E)) continue;
+        if (*E <= s->energy + 1e-4 * t * slope) return 1;
+        if (*E <= s->energy + 1e-13 * fabs(s->energy) &&
+            fabs(tss__dot_n(s->r, s->g_new, s->d)) <= -(1 - 2e-4) * slope)
+            return 1;
+    }
+    return 0;
+}
+
+static double tss__n_largest(const double *g, int r) {
+    double m = 0;
+    for (int i = 0; i < r; i++) m = fabs(g[i]) > m || isnan(g[i]) ? fabs(g[i]) : m;
+    return m;
+}
+
+static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
+    size_t wide = (size_t)s->r * sizeof(double);
+    s->pairs = 0, s->newest = 0;
+    for (*iterations = 0;; ++*iterations) {
+        double E;
+        if (tss__n_largest(s->g, s->r) <= s->def.eps) return TSS_EXIT_CONVERGED;
+        if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
+        tss__reduced_direction(s);
+        if (!(tss__dot_n(s->r, s->g, s->d) < 0)) s->pairs = 0, tss__reduced_direction(s);
+        if (!tss__reduced_line(s, &E)) {
+            s->current = 0;
+            return TSS_EXIT_LINE_SEARCH;
+        }
+        double fall = s->energy - E;
+        tss__reduced_learn(s);
+        memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
+        s->energy = E, s->current = 1;
+        if (tss__n_largest(s->g, s->r) <= s->def.eps) continue;  // counted as converged
+        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) return TSS_EXIT_SADDLE;
+    }
+}
+
+tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
+    size_t wide = (size_t)s->r * sizeof(double), long_ = s->n * sizeof(double);
+    tss_reduced_info info;
+    memset(&info, 0, sizeof info);
+    s->evaluations = 0;
+    for (size_t i = 0; i < s->n; i++) s->q[i] = 2 * s->x[i] - s->x_last[i];
+    for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
+    memcpy(s->z_last, s->z, wide), memcpy(s->x_last, s->x, long_);
+    s->energy = tss__reduced_energy(s, s->z, s->g);
+    double E = tss__reduced_energy(s, s->z_new, s->g_new);
+    s->current = E < s->energy;
+    if (s->current) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
+    info.exit = tss__reduced_minimise(s, &info.iterations);
+    if (!s->current) tss__reduced_energy(s, s->z, s->g_new);  // the last trial was not taken
+    info.energy = s->energy, info.gradient = tss__n_largest(s->g, s->r);
+    memcpy(s->x, s->job.p.x, long_);
+    info.evaluations = s->evaluations;
+    s->exits[info.exit]++;
+    if (out) *out = info;
+    return TSS_OK;
+}
+
+#ifdef __cplusplus
+}
+#endif
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC pop_options
+#endif
+#endif  // TSS_IMPLEMENTATION
+
+/*
+MIT License
+
+Copyright (c) 2026 The tss authors
+
+Permission is hereby granted, free of charge, to any person obtaining a copy
+of this software and associated documentation files (the "Software"), to deal
+in the Software without restriction, including without limitation the rights
+to use, copy, modify, merge, publish, distribute, sublicense, and/or sell
+copies of the Software, and to permit persons to whom the Software is
+furnished to do so, subject to the following conditions:
+
+The above copyright notice and this permission notice shall be included in all
+copies or substantial portions of the Software.
+
+THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR
+IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY,
+FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER
+LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM,
+OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
+SOFTWARE.
+*/
