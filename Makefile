@@ -93,7 +93,7 @@ sanitize nodeps compat fuzz:
 bench:
 	@sh bench/run.sh $(BUILD) $(OUT)/bench
 
-#: bench-error   error against run time at 50,000 tets and more → bench/results (an hour; goes on where it stopped)
+#: bench-error   error against run time at 50,000 tets and more → bench/results (two minutes a scene, one far more; goes on where it stopped)
 bench-error: $(BUILD)/tss
 	@sh bench/error.sh -b $(BUILD) large $(OUT)/bench-error
 	@mkdir -p bench/results

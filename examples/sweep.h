@@ -8,10 +8,11 @@
                   at the middle one of --nodes and the scene's tol
        direct pcg auto    full space, a row for each of --tols
 
-   The reference is full space at a ten-thousandth of the scene's tol. Its way is taken once; each step of
+   The reference is full space at a ten-thousandth of the scene's tol. Each step of
    each solver starts from it, and
        error = max ‖x − x_ref‖ / max ‖x_ref − x_t‖,    over the nodes that are free to move,
-   so that no solver pays for, or hides behind, what it did before. Seconds are the sum over the steps;
+   so that no solver pays for the errors of its earlier steps; what the adaptive one activated in
+   them it keeps. Seconds are the sum over the steps;
    with --repeat K all steps are taken K times, the solvers in turn at each, and a step's shortest
    time counts. With --from N >= 1 step N is taken by all and not timed: what is set up once, a
    partition or an ordering, is in it. Then
