@@ -7215,7 +7215,13 @@ static void tss__gradient_serial(tss_world *w, tss__entry *e, const double *x, d
 
 // Adds H_ab (dim × dim inside a row-major stencil matrix) to a block of the system matrix.
 static void tss__scatter_block(double *to, const double *from, int dim, int stride, double scale) {
-    for (int r = 0; r < dim; r++)
+    for (int r = 0; dim == 3 && r < 3; r++) {  // the same sums, unrolled
+        const double *row = from + r * stride;
+        double a = to[3 * r] + scale * row[0], b = to[3 * r + 1] + scale * row[1];
+        double c = to[3 * r + 2] + scale * row[2];
+        to[3 * r] = a, to[3 * r + 1] = b, to[3 * r + 2] = c;
+    }
+    for (int r = 0; dim != 3 && r < dim; r++)
         for (int c = 0; c < dim; c++) to[r * dim + c] += scale * from[r * stride + c];
 }
 

@@ -2452,7 +2452,7 @@ typedef struct tss__sub_cross {  // H between two bodies b < c, a_c × a_b colum
 
 typedef struct tss__sub_jlink {  // a block of K between an enriched and a border node
     int other;
-    const double *block;
+    double block[9];  // a copy: read in order, thirty times an iterate
 } tss__sub_jlink;
 
 typedef struct tss__sub_counts {
@@ -4405,7 +4405,8 @@ static tss_result tss__sub_extract(tss_subspace *s, const tss_unknowns *u, const
 static tss_result tss__sub_link(tss_subspace *s, int *count, tss__sub_buf *list, int other, const double *blk) {
     tss__sub_jlink *l = (tss__sub_jlink *)tss__sub_need(s, list, (size_t)*count + 1, sizeof *l);
     if (!l) return tss__sub_no_memory(s);
-    l[*count].other = other, l[*count].block = blk;
+    l[*count].other = other;
+    memcpy(l[*count].block, blk, (size_t)(s->dim * s->dim) * sizeof(double));
     ++*count;
     return TSS_OK;
 }
@@ -4461,8 +4462,19 @@ static tss_result tss__sub_build_J(tss_subspace *s, const tss_unknowns *u) {
 static void tss__sub_follow(const tss_subspace *s, const tss__sub_buf *ptr, const tss__sub_buf *list, int i, double sign,
                             const double *x, double *y) {
     const tss__sub_jlink *l = (const tss__sub_jlink *)list->p;
-    const int d = s->dim;
-    for (int k = tss__sub_i(ptr)[i]; k < tss__sub_i(ptr)[i + 1]; k++)
+    const int d = s->dim, from = tss__sub_i(ptr)[i], to = tss__sub_i(ptr)[i + 1];
+    if (d == 3) {
+        double a = 0, b = 0, c = 0;
+        for (int k = from; k < to; k++) {
+            const double *blk = l[k].block, *v = x + l[k].other * 3;
+            a += blk[0] * v[0] + blk[1] * v[1] + blk[2] * v[2];
+            b += blk[3] * v[0] + blk[4] * v[1] + blk[5] * v[2];
+            c += blk[6] * v[0] + blk[7] * v[1] + blk[8] * v[2];
+        }
+        y[0] += sign * a, y[1] += sign * b, y[2] += sign * c;
+        return;
+    }
+    for (int k = from; k < to; k++)
         for (int p = 0; p < d; p++)
             for (int q = 0; q < d; q++) y[p] += sign * l[k].block[p * d + q] * x[l[k].other * d + q];
 }
