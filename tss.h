@@ -751,6 +751,10 @@ typedef struct tss_step_info {
 // Partition, masses, symbolic work; then steps may be taken. Errors: EMPTY, NO_MEMORY and those of
 // the energies. Cheap when nothing changed.
 TSS_API tss_result tss_world_prepare(tss_world *w);
+// Optional, after everything was added: prepare, and what the solver makes once (a subspace its
+// groups, tables and Gram matrices), so that the first step takes no longer than others. Same
+// errors; it changes no bit of any step.
+TSS_API tss_result tss_world_ready(tss_world *w);
 // One time step of length dt, to tolerance. A numerical failure is a status, not an error: time
 // goes on and the state is the last accepted iterate, always feasible. info may be NULL. On an error the
 // state is that before the call.
@@ -807,6 +811,8 @@ typedef struct tss_direction_def {
     const char *name;  // for messages; a string that outlives the world
     void *user;
     // All but direction may be NULL. w's current state is x at the start of the step.
+    // Called by tss_world_ready, with the fixed lists in use: what needs to be made once.
+    tss_result (*prepare)(void *user, tss_world *w, const tss_ctx *c);
     tss_result (*begin_step)(void *user, tss_world *w, const tss_ctx *c);
     tss_result (*direction)(void *user, tss_world *w, tss_iterate *it);
     // After the line search took x0 → x1 = x0 + α·d.
@@ -8886,6 +8892,18 @@ tss_result tss_world_prepare(tss_world *w) {
     w->write_stamp++;
     w->prepared = 1;
     return TSS_OK;
+}
+
+tss_result tss_world_ready(tss_world *w) {
+    tss_result r = tss_world_prepare(w);
+    if (r != TSS_OK || !w->finder.prepare) return r;
+    for (int k = 0; k < w->entry_count; k++) {
+        tss__entry *e = TSS__ENTRY(w, k);
+        if (!tss__in_matrix(e, 0)) continue;
+        r = e->def.lists(e->def.user, &w->ctx, tss__f64(&w->x), NULL, 0, &e->list);
+        if (r != TSS_OK) return tss_world_fail(w, r, "%s: %s", e->name, tss_result_text(r));
+    }
+    return w->finder.prepare(w->finder.user, w, &w->ctx);
 }
 
 // ---------------------------------------------------------------------------------------------

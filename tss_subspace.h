@@ -2897,11 +2897,6 @@ static tss_result tss__sub_build_lists(tss_subspace *s) {
     return TSS_OK;
 }
 
-static int tss__sub_compare_keys(const void *a, const void *b) {
-    uint64_t x = *(const uint64_t *)a, y = *(const uint64_t *)b;
-    return x < y ? -1 : x > y;
-}
-
 // Room for all parts: what one holds is bounded by its stencils.
 static tss_result tss__sub_build_room(tss_subspace *s, int64_t *nodes, int64_t *pairs) {
     const int *ptr = tss__sub_i(&s->stencil_ptr);
@@ -2919,13 +2914,13 @@ static tss_result tss__sub_build_room(tss_subspace *s, int64_t *nodes, int64_t *
             if (count == 0 || tss_energy_get(s->w, e, &v) != TSS_OK) continue;
             *nodes += (int64_t)count * v.def->arity;
             slots += (int64_t)count * v.def->arity * v.def->arity;
-            here += (int64_t)count * v.def->arity * v.def->arity;
+            here += (int64_t)count * v.def->arity;
         }
         most = here > most ? here : most;
     }
     *pairs = slots;
-    size_t work = (size_t)(most + 1) * sizeof(uint64_t) + (size_t)s->n * sizeof(int);
-    if (!tss__sub_need(s, &s->scratch, work, 1) ||
+    size_t work = 4 * (size_t)most + 1 + (size_t)s->n;
+    if (!tss__sub_need(s, &s->scratch, work, sizeof(int)) ||
         !tss__sub_need(s, &s->parts, (size_t)s->groups, sizeof(tss__sub_part)) ||
         !tss__sub_need(s, &s->stencil_local, (size_t)(*nodes), sizeof(int)) ||
         !tss__sub_need(s, &s->stencil_slot, (size_t)slots, sizeof(int)))
@@ -2951,24 +2946,39 @@ static int tss__sub_part_nodes(tss_subspace *s, int p, int *local, int *list) {
     return count;
 }
 
-// All (row, col) keys of part p, sorted, without doubles; returns how many.
-static int tss__sub_part_keys(tss_subspace *s, int p, uint64_t *key) {
-    size_t count = 0;
-    for (int e = 0; e < s->entries; e++) {
-        tss_energy_view v;
-        int k = p * s->entries + e, m = tss__sub_i(&s->stencil_ptr)[k + 1] - tss__sub_i(&s->stencil_ptr)[k];
-        if (m == 0 || tss_energy_get(s->w, e, &v) != TSS_OK) continue;
-        const int A = v.def->arity, *l = tss__sub_i(&s->stencil_local) + ((int64_t *)s->stencil_at.p)[2 * k];
-        for (int t = 0; t < m; t++, l += A)
-            for (int i = 0; i < A; i++)
-                for (int j = 0; j < A; j++)
-                    if (l[i] >= 0 && l[j] >= 0) key[count++] = (uint64_t)l[i] << 32 | (uint64_t)l[j];
+// The block pattern of part p, from a table of its stencils by local node: row (nodes + 1) and the
+// columns of each row, ascending; returns the blocks. work: ints, see tss__sub_build_room.
+static int tss__sub_part_pattern(tss_subspace *s, int p, int nodes, int *row, int *col, int *work) {
+    int *from = work, *mark = from + nodes + 1, *list = mark + nodes, blocks = 0;
+    const int64_t first = ((int64_t *)s->stencil_at.p)[2 * p * s->entries];
+    const int *local = tss__sub_i(&s->stencil_local) + first;
+    memset(from, 0, (size_t)(nodes + 1) * sizeof(int));
+    for (int i = 0; i < nodes; i++) mark[i] = -1;
+    for (int pass = 0; pass < 2; pass++) {
+        for (int e = 0; e < s->entries; e++) {
+            tss_energy_view v;
+            int k = p * s->entries + e, m = tss__sub_i(&s->stencil_ptr)[k + 1] - tss__sub_i(&s->stencil_ptr)[k];
+            if (m == 0 || tss_energy_get(s->w, e, &v) != TSS_OK) continue;
+            const int A = v.def->arity, at = (int)(((int64_t *)s->stencil_at.p)[2 * k] - first);
+            for (int t = at; t < at + m * A; t++) {
+                if (local[t] < 0) continue;
+                if (pass == 0) from[local[t]]++;
+                else list[2 * --from[local[t]]] = at + (t - at) / A * A, list[2 * from[local[t]] + 1] = A;
+            }
+        }
+        for (int i = 0; pass == 0 && i < nodes; i++) from[i + 1] += from[i];
     }
-    qsort(key, count, sizeof *key, tss__sub_compare_keys);
-    int unique = 0;
-    for (size_t k = 0; k < count; k++)
-        if (k == 0 || key[k] != key[k - 1]) key[unique++] = key[k];
-    return unique;
+    for (int i = 0; i < nodes; i++) {
+        row[i] = blocks;
+        for (int t = from[i]; t < from[i + 1]; t++)
+            for (int j = 0; j < list[2 * t + 1]; j++) {
+                int other = local[list[2 * t] + j];
+                if (other >= 0 && mark[other] != i) mark[other] = i, col[blocks++] = other;
+            }
+        tss__sort_ints(col + row[i], blocks - row[i]);
+    }
+    row[nodes] = blocks;
+    return blocks;
 }
 
 // Where each pair of each stencil of part p goes.
@@ -2996,8 +3006,8 @@ static tss_result tss__sub_build_parts(tss_subspace *s) {
     int64_t room, pairs;
     if (r == TSS_OK) r = tss__sub_build_room(s, &room, &pairs);
     if (r != TSS_OK) return r;
-    int *local = (int *)s->scratch.p;
-    uint64_t *key = (uint64_t *)(void *)((char *)s->scratch.p + ((size_t)s->n * sizeof(int) + 7) / 8 * 8);
+    const int64_t *at = (int64_t *)s->stencil_at.p;
+    int *local = (int *)s->scratch.p, *work = local + s->n;
     int *list = (int *)tss__sub_need(s, &s->part_node, (size_t)room, sizeof(int));
     int *row = (int *)tss__sub_need(s, &s->part_row, (size_t)(room + s->groups), sizeof(int));
     if (!list || !row) return tss__sub_no_memory(s);
@@ -3010,14 +3020,11 @@ static tss_result tss__sub_build_parts(tss_subspace *s) {
         t->node0 = node0, t->row0 = row0, t->col0 = col0;
         t->nodes = tss__sub_part_nodes(s, p, local, list + node0);
         for (int i = 0; i < t->nodes; i++) local[list[node0 + i]] = -1;
-        int blocks = tss__sub_part_keys(s, p, key), at = 0;
-        int *col = (int *)tss__sub_need(s, &s->part_col, (size_t)(col0 + blocks), sizeof(int));
+        int64_t most = (p + 1 < s->groups ? at[2 * (p + 1) * s->entries + 1] : pairs) - at[2 * p * s->entries + 1];
+        int *col = (int *)tss__sub_need(s, &s->part_col, (size_t)(col0 + most), sizeof(int));
         if (!col) return tss__sub_no_memory(s);
         col += col0;
-        for (int i = 0; i <= t->nodes; i++) {
-            row[row0 + i] = at;
-            while (at < blocks && (int)(key[at] >> 32) == i) col[at] = (int)(key[at] & 0xffffffffu), at++;
-        }
+        int blocks = tss__sub_part_pattern(s, p, t->nodes, row + row0, col, work);
         tss__sub_part_slots(s, p, row + row0, col);
         node0 += t->nodes, row0 += t->nodes + 1, col0 += blocks;
         if (t->nodes > s->most_nodes) s->most_nodes = t->nodes;
@@ -4056,6 +4063,11 @@ static void tss__sub_sum_task(int j, int worker, void *arg) {
         if (t->valid && t->fresh && t->used > 0)
             tss__sub_axpy((int)a - j, 1, tss__sub_f(&u->s->secant) + t->h + (size_t)j * a + j, to + j);
     }
+}
+
+static int tss__sub_compare_keys(const void *a, const void *b) {
+    uint64_t x = *(const uint64_t *)a, y = *(const uint64_t *)b;
+    return x < y ? -1 : x > y;
 }
 
 // Pairs of bodies that share a block of A or C, as keys b · count + c with b < c, sorted.
@@ -5476,6 +5488,19 @@ static void tss__sub_accepted(void *user, const tss_ctx *c, const double *x0, co
     }
 }
 
+// Tables, and the modes unless they wait for a refresh callback.
+static tss_result tss__sub_prepare(void *user, tss_world *w, const tss_ctx *c) {
+    tss_subspace *s = (tss_subspace *)user;
+    tss_unknowns u;
+    tss_world_unknowns(w, &u);
+    if (s->def.mode == TSS_MODE_FULL || s->modal_count == 0) return TSS_OK;
+    s->dim = c->dim;
+    tss_result r = tss__sub_build(s, c, &u);
+    for (int k = 0; k < s->basis_count; k++)
+        if (tss__sub_base(s, k)->live && tss__sub_base(s, k)->def.refresh) return r;
+    return r == TSS_OK ? tss__sub_refresh(s, &s->modes) : r;
+}
+
 // Columns of CUSTOM bases for the step to come.
 static void tss__sub_refresh_custom(tss_subspace *s, const tss_ctx *c) {
     for (int k = 0; k < s->basis_count; k++) {
@@ -5831,7 +5856,7 @@ tss_result tss_subspace_add(tss_world *w, const tss_subspace_def *def, tss_subsp
     memset(s, 0, sizeof *s);
     s->def = *def, s->w = w, s->host = *tss_world_host(w), s->dim = tss_world_dim(w);
     tss_direction_def d = tss_direction_def_default();
-    d.name = "subspace", d.user = s;
+    d.name = "subspace", d.user = s, d.prepare = tss__sub_prepare;
     d.begin_step = tss__sub_begin_step, d.direction = tss__sub_direction, d.accepted = tss__sub_accepted;
     d.end_step = tss__sub_end_step, d.diagonal = tss__sub_diagonal, d.state = tss__sub_state;
     d.destroy = tss__sub_destroy;

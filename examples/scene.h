@@ -2757,7 +2757,7 @@ int scene_build(scene *s, const tss_host *host,
     ok = ok && scene__add_bases(s, w, error);
     s->forces_on = (char *)calloc((size_t)forces + 1, 1);
     if (ok && !s->forces_on) ok = scene__fail(error, "out of memory");
-    if (ok && (r = tss_world_prepare(w)) != TSS_OK) ok = scene__world_fail(error, s, w, r);
+    if (ok && (r = tss_world_ready(w)) != TSS_OK) ok = scene__world_fail(error, s, w, r);
     if (ok)
         *out = w;
     else
