@@ -2432,6 +2432,7 @@ typedef struct tss__modal {  // a body with modes
     tss__sub_buf q;          // columns: Σ α d_q over the step, by place among all modes
     tss__sub_buf s;          // a: α d_q since the last secant update
     tss__sub_buf sum;        // a × a, lower triangle: Σ H^ℓ over valid parts
+    tss__sub_buf exact[2];   // a × a, lower triangle: UᵀAU, of all nodes and of those not enriched
     int sum_stale;
 } tss__modal;
 
@@ -2490,6 +2491,9 @@ struct tss_subspace {
     tss__sub_buf secant, secant_g, part_diag;           // H^ℓ; modal gradients; diagonal blocks
     size_t modal_g;                                     // Σ a over the parts
     double moved;                                       // Σ ‖α d‖∞ since the last update of the secants
+    double drift;                                       // the same since A was summed
+    int kept, kept_H, kept_x;                           // A, m->exact[mask] (a bit each), Ax are those of the iterate before
+    uint64_t kept_stamp;                                // x_stamp then
     int entries;                                        // energies when built
     uint64_t patterns;                                  // sum of the secant lists' patterns
     tss__sub_buf near_ptr, near_id;                     // node → fixed stencils (entry, id)
@@ -3723,6 +3727,7 @@ static tss_result tss__sub_update_secants(tss_subspace *s, const tss_iterate *it
     }
     tss_world_clock_phase(s->w, TSS_PHASE_GRADIENT);
     if (stale > 0) {
+        s->kept = 0;  // stencils may leave A
         // parts that start here remember where: their gradient at x
         tss_parallel(&s->host, s->groups, tss__sub_hold_task, &run);
         if (s->def.secant == TSS_SECANT_BFGS) {
@@ -3789,6 +3794,24 @@ static void tss__sub_open_rows(tss_subspace *s, const tss_unknowns *u, const tss
     }
 }
 
+// ‖Σ α d‖∞ in tolerances within which A is not summed anew. 10 to 80 took the same iterates in
+// jello_rubber.json, where a cell is 1,500 tolerances wide.
+#define TSS__SUB_LAG 20.0
+
+// Whether A of the iterate before will do: nodes have hardly moved since it was summed, nothing of it
+// has joined a secant, and all it holds changes with F alone, or not at all. As for secants, the
+// Newton matrix is then an approximation; ∇E, contact and what converges are not.
+static int tss__sub_lags(const tss_subspace *s, const tss_iterate *it, const tss_bcsr *A) {
+    if (!s->kept || s->kept_stamp != s->x_stamp || s->def.secant == TSS_SECANT_EXACT || it->moves || s->query) return 0;
+    if (s->drift > TSS__SUB_LAG * it->tol || A->val != s->A.val || A->pattern != s->A.pattern) return 0;
+    for (int e = 0; e < tss_world_energies(s->w); e++) {
+        tss_energy_view v;
+        if (tss_energy_get(s->w, e, &v) != TSS_OK || (v.def->flags & TSS_ENERGY_DYNAMIC)) continue;
+        if (!(v.def->flags & (TSS_ENERGY_SECANT_OK | TSS_ENERGY_CONST_HESSIAN))) return 0;
+    }
+    return 1;
+}
+
 // again 0: a new iterate; 1: what nodes just enriched brought.
 static tss_result tss__sub_assemble(tss_subspace *s, const tss_iterate *it, const tss_unknowns *u, int again) {
     tss_result r = TSS_OK;
@@ -3801,19 +3824,25 @@ static tss_result tss__sub_assemble(tss_subspace *s, const tss_iterate *it, cons
     uint8_t *want = (uint8_t *)tss__sub_need(s, &s->want, most, 1);
     uint8_t *live = (uint8_t *)tss__sub_need(s, &s->live_row, (size_t)u->rows, 1);
     if (!want || !live) return tss__sub_no_memory(s);
+    int lags = 0;
     if (!again) {
-        if ((r = tss_world_matrices(s->w, &s->A, &s->C)) != TSS_OK) return r;
-        memset(live, 0, (size_t)u->rows);
+        tss_bcsr A;
+        if ((r = tss_world_matrices(s->w, &A, &s->C)) != TSS_OK) return r;
+        lags = tss__sub_lags(s, it, &A);
+        s->A = A, s->kept = 0;  // until this iterate has its direction
+        if (!lags) memset(live, 0, (size_t)u->rows), s->drift = 0;
         memset(s->C.val, 0, (size_t)s->C.row[u->rows] * (size_t)dd * sizeof(double));
         for (int k = 0; k < u->rows; k++)
             for (int c = 0; c < s->dim; c++)
                 tss__sub_f(&s->rhs)[k * s->dim + c] = -it->g[u->node[k] * s->dim + c];
     }
+    if (!lags) s->kept_H = 0, s->kept_x = 0;
     tss_world_clock_phase(s->w, TSS_PHASE_ASSEMBLE);
     for (int e = 0; e < tss_world_energies(s->w) && r == TSS_OK; e++) {
         tss_energy_view v;
         int all = 0, any;
         if (tss_energy_get(s->w, e, &v) != TSS_OK || v.list.count == 0) continue;
+        if (lags && !(v.def->flags & TSS_ENERGY_DYNAMIC)) continue;
         tss_energy_view secant;
         if (tss__sub_secant_entry(s, e, &secant)) any = tss__sub_choose_secant(s, e, v.list.count, again, want);
         else if (v.inertia) any = tss__sub_choose_inertia(s, &v, again, want);
@@ -3974,35 +4003,31 @@ static tss_result tss__sub_extend(tss_subspace *s, const double *q, int mask, do
 typedef struct tss__sub_project {
     tss_subspace *s;
     const tss_unknowns *u;
-    int row_body, col_body, mask;
-    const int *node;  // rows: world nodes
+    int row_body, col_body, mask, from;  // from: matrices, 1: A, 2: C
+    const int *node;                     // rows: world nodes
     int count;
     double *lane, *work;
     size_t lane_each, each;
 } tss__sub_project;
 
-// T (d × a of body) += K_i U over the neighbours in that body; 0 if there are none.
-static int tss__sub_times_row(const tss_subspace *s, const tss_unknowns *u, int row, int body, int mask, double *T) {
-    const tss__modal *m = tss__sub_modal(s, body);
+// T (d × a of body) += K_i U over the neighbours in that body.
+static void tss__sub_times_row(const tss__sub_project *p, int row, double *T) {
+    const tss_subspace *s = p->s;
+    const tss__modal *m = tss__sub_modal(s, p->col_body);
     const int d = s->dim, dd = d * d;
-    int any = 0;
     for (int part = 0; part < 2; part++) {
         const tss_bcsr *K = part ? &s->C : &s->A;
-        if (!part && !tss__sub_u(&s->live_row)[row]) continue;
+        if (!(p->from & (1 << part)) || (!part && !tss__sub_u(&s->live_row)[row])) continue;
         for (int64_t k = K->row[row]; k < K->row[row + 1]; k++) {
-            int j = u->node[K->col[k]];
-            if (tss__sub_i(&s->body_of)[j] != body || (mask && tss__sub_u(&s->on)[j])) continue;
+            int j = p->u->node[K->col[k]];
+            if (tss__sub_i(&s->body_of)[j] != p->col_body || (p->mask && tss__sub_u(&s->on)[j])) continue;
             const double *blk = K->val + k * dd;
-            double size = 0;
-            for (int q = 0; q < dd; q++) size += fabs(blk[q]);
-            if (size == 0) continue;
+            if (!tss__sub_nonzero(blk, dd)) continue;
             size_t at = (size_t)tss__sub_i(&s->live_index)[j];
             tss__sub_row_times(d, m->c, m->r, blk, tss__sub_f(&m->phi) + at * (size_t)m->c,
                                tss__sub_f(&m->vec) + at * (size_t)(d * m->r), T);
-            any = 1;
         }
     }
-    return any;
 }
 
 static void tss__sub_project_task(int lane, int worker, void *arg) {
@@ -4019,7 +4044,7 @@ static void tss__sub_project_task(int lane, int worker, void *arg) {
         for (int i = 0; i < n; i++) {
             int node = p->node[from + i];
             size_t at = (size_t)tss__sub_i(&s->live_index)[node];
-            tss__sub_times_row(s, p->u, p->u->row[node], p->col_body, p->mask, T + i * d * a);
+            tss__sub_times_row(p, p->u->row[node], T + i * d * a);
             memcpy(phi + i * c, tss__sub_f(&mr->phi) + at * (size_t)c, (size_t)c * sizeof(double));
             memcpy(vec + i * d * r, tss__sub_f(&mr->vec) + at * (size_t)(d * r), (size_t)(d * r) * sizeof(double));
         }
@@ -4027,12 +4052,12 @@ static void tss__sub_project_task(int lane, int worker, void *arg) {
     }
 }
 
-// H (a_c × a_b) += U_cᵀ K U_b over the given rows of body b.
-static tss_result tss__sub_project_rows(tss_subspace *s, const tss_unknowns *u, int b, int c, int mask,
+// H (a_c × a_b) += U_cᵀ K U_b over the given rows of body b, K of the given matrices.
+static tss_result tss__sub_project_rows(tss_subspace *s, const tss_unknowns *u, int b, int c, int mask, int from,
                                         const int *node, int count, double *H) {
     const tss__modal *mb = tss__sub_modal(s, b), *mc = tss__sub_modal(s, c);
     if (count == 0 || mb->a == 0 || mc->a == 0) return TSS_OK;
-    tss__sub_project p = {s, u, b, c, mask, node, count, NULL, NULL, 0, 0};
+    tss__sub_project p = {s, u, b, c, mask, from, node, count, NULL, NULL, 0, 0};
     p.lane_each = (size_t)mb->a * (size_t)mc->a;
     p.each = (size_t)(TSS__SUB_CHUNK * (s->dim * mc->a + mb->c + s->dim * mb->r));
     p.lane = (double *)tss__sub_need(s, &s->lane, TSS__SUB_LANES * p.lane_each, sizeof(double));
@@ -4103,14 +4128,16 @@ static tss_result tss__sub_find_crosses(tss_subspace *s, const tss_unknowns *u) 
     return tss__sub_need(s, &s->cross_val, at, sizeof(double)) ? TSS_OK : tss__sub_no_memory(s);
 }
 
-// Live rows of body b that are wanted: not enriched (mask), with a neighbour in body c (c ≥ 0).
-static int tss__sub_pick_rows(const tss_subspace *s, const tss_unknowns *u, int b, int c, int mask, int *out) {
+// Live rows of body b that are wanted: not enriched (mask), in one of the matrices, with a neighbour
+// in body c (c ≥ 0).
+static int tss__sub_pick_rows(const tss_subspace *s, const tss_unknowns *u, int b, int c, int mask, int from, int *out) {
     const tss__modal *m = tss__sub_modal(s, b);
     int count = 0;
     for (int k = 0; k < m->lives; k++) {
-        int node = tss__sub_i(&m->live)[k], row = u->row[node], near = c < 0;
+        int node = tss__sub_i(&m->live)[k], row = u->row[node];
         if (mask && tss__sub_u(&s->on)[node]) continue;
-        for (int part = 0; !near && part < 2; part++) {
+        int near = c < 0 && (((from & 1) && tss__sub_u(&s->live_row)[row]) || ((from & 2) && s->C.row[row] < s->C.row[row + 1]));
+        for (int part = 0; c >= 0 && !near && part < 2; part++) {
             const tss_bcsr *K = part ? &s->C : &s->A;
             if (!part && !tss__sub_u(&s->live_row)[row]) continue;
             for (int64_t q = K->row[row]; !near && q < K->row[row + 1]; q++)
@@ -4140,9 +4167,16 @@ static tss_result tss__sub_build_H(tss_subspace *s, const tss_unknowns *u, const
         if (!sum.H) return tss__sub_no_memory(s);
         if (m->sum_stale) tss_parallel(&s->host, m->a, tss__sub_sum_task, &sum);
         m->sum_stale = 0;
-        for (size_t q = 0; q < aa; q++) H[m->hat + q] += sum.H[q];
-        int count = tss__sub_pick_rows(s, u, k, -1, mask, list);
-        r = tss__sub_project_rows(s, u, k, k, mask, list, count, H + m->hat);
+        double *E = (double *)tss__sub_need(s, &m->exact[mask], aa, sizeof(double));
+        if (!E) return tss__sub_no_memory(s);
+        if (!(s->kept_H & (1 << mask))) {
+            memset(E, 0, aa * sizeof(double));
+            int rows = tss__sub_pick_rows(s, u, k, -1, mask, 1, list);
+            r = tss__sub_project_rows(s, u, k, k, mask, 1, list, rows, E);
+        }
+        for (size_t q = 0; q < aa; q++) H[m->hat + q] += sum.H[q] + E[q];
+        int count = tss__sub_pick_rows(s, u, k, -1, mask, 2, list);
+        if (r == TSS_OK) r = tss__sub_project_rows(s, u, k, k, mask, 2, list, count, H + m->hat);
         for (int i = 0; i < m->a; i++)  // the two halves differ by rounding
             for (int j = 0; j < i; j++) H[m->hat + (size_t)(i * m->a + j)] = H[m->hat + (size_t)(j * m->a + i)];
     }
@@ -4150,9 +4184,10 @@ static tss_result tss__sub_build_H(tss_subspace *s, const tss_unknowns *u, const
         const tss__sub_cross *x = (const tss__sub_cross *)s->cross.p + k;
         double *val = tss__sub_f(&s->cross_val) + x->at;
         memset(val, 0, (size_t)tss__sub_modal(s, x->b)->a * (size_t)tss__sub_modal(s, x->c)->a * sizeof(double));
-        int count = tss__sub_pick_rows(s, u, x->b, x->c, mask, list);
-        r = tss__sub_project_rows(s, u, x->b, x->c, mask, list, count, val);
+        int count = tss__sub_pick_rows(s, u, x->b, x->c, mask, 3, list);
+        r = tss__sub_project_rows(s, u, x->b, x->c, mask, 3, list, count, val);
     }
+    if (r == TSS_OK) s->kept_H |= 1 << mask;
     return r;
 }
 
@@ -4656,6 +4691,7 @@ static tss_result tss__sub_factor_x(tss_subspace *s) {
                 double *v = tss_bcsr_block(&s->Ax, i, i) + c * s->dim + c;
                 *v += shift * fabs(*v);
             }
+        s->kept_x = 0;
     }
 }
 
@@ -5421,7 +5457,8 @@ static tss_result tss__sub_masked_solve(tss_subspace *s, const tss_iterate *it, 
     if (s->xrows == 0)
         r = tss__sub_modal_apply(s, 1, rq, dq);
     else {
-        r = tss__sub_extract(s, u, &s->A, s->x_from, &s->Ax);
+        if (!s->kept_x) r = tss__sub_extract(s, u, &s->A, s->x_from, &s->Ax);
+        s->kept_x = r == TSS_OK;
         if (r == TSS_OK) r = tss__sub_extract(s, u, &s->C, s->x_from + 1, &s->Cx);
         if (r == TSS_OK) r = tss__sub_build_J(s, u);
 #ifdef TSS_SUBSPACE_DEBUG
@@ -5468,7 +5505,8 @@ static tss_result tss__sub_direction(void *user, tss_world *w, tss_iterate *it) 
     }
     if (!tss__sub_need(s, &s->dq, 3 * s->modes, sizeof(double))) return tss__sub_no_memory(s);
     if ((r = tss__sub_refresh(s, &s->modes)) == TSS_OK) r = tss__sub_masked_solve(s, it, &u);
-    it->handled = s->solved = r == TSS_OK;
+    it->handled = s->solved = s->kept = r == TSS_OK;
+    s->kept_stamp = s->x_stamp;
     return r;
 }
 
@@ -5477,7 +5515,7 @@ static void tss__sub_accepted(void *user, const tss_ctx *c, const double *x0, co
     (void)c;
     double most = 0;
     for (int k = 0; k < s->n * s->dim; k++) most = fabs(x1[k] - x0[k]) > most ? fabs(x1[k] - x0[k]) : most;
-    s->moved += most;
+    s->moved += most, s->drift += most;
     for (int k = 0; s->solved && k < s->modal_count; k++) {
         tss__modal *m = tss__sub_modal(s, k);
         const double *dq = tss__sub_f(&s->dq) + m->at;
@@ -5517,7 +5555,7 @@ static tss_result tss__sub_begin_step(void *user, tss_world *w, const tss_ctx *c
     (void)w;
     s->ctx = c;
     s->counts.linear_iterations = s->counts.factorizations = 0;
-    s->moved = 0;
+    s->moved = 0, s->kept = 0;
     tss__sub_refresh_custom(s, c);
     for (int p = 0; s->built && p < s->groups; p++) tss__sub_parts(s, p)->fresh = 0;
     for (int k = 0; k < s->modal_count; k++) {
@@ -5804,7 +5842,7 @@ static tss_result tss__sub_def_ok(tss_world *w, const tss_subspace_def *d) {
 
 static void tss__sub_free_modal(tss_subspace *s, tss__modal *m) {
     tss__sub_buf *all[] = {&m->block, &m->gram, &m->thin_gram, &m->wide, &m->thin, &m->live, &m->phi, &m->vec,
-                           &m->map, &m->map_block, &m->q, &m->s, &m->sum};
+                           &m->map, &m->map_block, &m->q, &m->s, &m->sum, m->exact, m->exact + 1};
     for (size_t k = 0; k < sizeof all / sizeof *all; k++) tss__sub_drop(s, all[k]);
 }
 
