@@ -4707,13 +4707,13 @@ static int tss__ipc_crosses(const tss_ctx *c, const double *x, const int *e, con
 }
 
 typedef struct tss__ipc_span {
-    double lo, hi;
+    double box[6];  // lower, upper
     int id;
 } tss__ipc_span;
 
 static int tss__ipc_span_order(const void *a, const void *b) {
     const tss__ipc_span *s = (const tss__ipc_span *)a, *t = (const tss__ipc_span *)b;
-    if (s->lo != t->lo) return s->lo < t->lo ? -1 : 1;
+    if (s->box[0] != t->box[0]) return s->box[0] < t->box[0] ? -1 : 1;
     return s->id < t->id ? -1 : s->id > t->id;
 }
 
@@ -4750,19 +4750,22 @@ static void tss__ipc_fresh_box(const tss_ipc *p, const tss_ctx *c, const double 
     }
 }
 
-// Extents along x of the primitives whose boxes meet `box`, sorted; returns their number.
+// 1 if two boxes share a point.
+static int tss__ipc_boxes_meet(const double a[6], const double b[6], int dim) {
+    int meet = 1;
+    for (int k = 0; k < dim; k++) meet = meet && a[k] <= b[3 + k] && a[3 + k] >= b[k];
+    return meet;
+}
+
+// Boxes of the primitives that meet `box`, sorted by where they begin in x; returns their number.
 static int tss__ipc_spans(const tss_ctx *c, const double *x, const double box[6], int count,
                           int arity, const int *node, tss__ipc_span *out) {
     int kept = 0;
     for (int i = 0; i < count; i++) {
-        double own[6];
-        int meets = 1;
-        tss__ipc_empty(own);
-        tss__ipc_grow(c, x, node + i * arity, arity, own);
-        for (int a = 0; a < c->dim; a++)
-            meets = meets && own[a] <= box[3 + a] && own[3 + a] >= box[a];
-        out[kept].lo = own[0], out[kept].hi = own[3], out[kept].id = i;
-        kept += meets;
+        tss__ipc_empty(out[kept].box);
+        tss__ipc_grow(c, x, node + i * arity, arity, out[kept].box);
+        out[kept].id = i;
+        kept += tss__ipc_boxes_meet(out[kept].box, box, c->dim);
     }
     qsort(out, (size_t)kept, sizeof *out, tss__ipc_span_order);
     return kept;
@@ -4799,13 +4802,13 @@ static int tss__ipc_intersections(tss_ipc *p, const tss_ctx *c, const double *x,
     int edges = tss__ipc_spans(c, x, box, s->edges, 2, s->edge, e);
     count = tss__ipc_spans(c, x, box, count, arity, other, f);
     for (int i = 0; i < count; i++)
-        widest = f[i].hi - f[i].lo > widest ? f[i].hi - f[i].lo : widest;
+        widest = f[i].box[3] - f[i].box[0] > widest ? f[i].box[3] - f[i].box[0] : widest;
     for (int i = 0; i < edges; i++) {
         const int *v = s->edge + 2 * e[i].id;
-        while (first < count && f[first].lo < e[i].lo - widest) first++;
-        for (int k = first; k < count && f[k].lo <= e[i].hi; k++) {
+        while (first < count && f[first].box[0] < e[i].box[0] - widest) first++;
+        for (int k = first; k < count && f[k].box[0] <= e[i].box[3]; k++) {
             const int *t = other + arity * f[k].id;
-            if (f[k].hi < e[i].lo || (c->dim == 2 && f[k].id <= e[i].id) ||
+            if (!tss__ipc_boxes_meet(f[k].box, e[i].box, c->dim) || (c->dim == 2 && f[k].id <= e[i].id) ||
                 !tss__ipc_may_meet(p, c, v, t, arity))
                 continue;
             if (!(c->dim == 3 ? tss__ipc_pierces(c, x, v, t) : tss__ipc_crosses(c, x, v, t)))
