@@ -3240,7 +3240,10 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
         memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
         s->energy = E, s->current = 1;
         if (tss__n_largest(s->g, s->r) <= s->def.eps) continue;  // counted as converged
-        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) return TSS_EXIT_SADDLE;
+        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) {
+            ++*iterations;  // this one
+            return TSS_EXIT_SADDLE;
+        }
     }
 }
 

@@ -1440,7 +1440,8 @@ static void test_reduced_exits(void **state) {
         assert_int_equal(info.exit, kind);
         assert_int_equal(tss_reduced_exits(sim)[kind], 1);
         // What is reported is E and its gradient at z, whatever was tried last.
-        double x[200], z[R], E[3];
+        double x[200], z[R], z_end[R], E[3];
+        memcpy(z_end, tss_reduced_z(sim), sizeof z_end);
         for (int side = -1; side <= 1; side++) {
             for (int i = 0; i < R; i++)
                 z[i] = tss_reduced_z(sim)[i] + (i == kind % R ? 1e-3 * side : 0);
@@ -1459,6 +1460,16 @@ static void test_reduced_exits(void **state) {
             assert_int_equal(tss_reduced_step(sim, NULL), TSS_OK);  // allowance is 0
         tss_reduced_destroy(sim);
         assert_int_equal(held, 0);
+        if (kind != TSS_EXIT_SADDLE && kind != TSS_EXIT_CONVERGED) continue;
+        // So many iterations and no tolerances: the same z.
+        memcpy(z, z_end, sizeof z);
+        d.eps = d.ftol = 0, d.max_iterations = info.iterations, allowance = 100;
+        assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_OK);
+        tss_reduced_set_force(sim, force);
+        assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+        assert_int_equal(info.exit, TSS_EXIT_ITERATIONS);
+        assert_memory_equal(tss_reduced_z(sim), z, sizeof z);
+        tss_reduced_destroy(sim);
     }
     tss_reduced_def d = tss_reduced_def_default();
     tss_reduced *sim;
