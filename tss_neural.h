@@ -428,14 +428,16 @@ typedef struct tss_reduced_info {
 } tss_reduced_info;
 
 typedef struct tss_reduced tss_reduced;  // opaque
-// Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+// Errors: BAD_ARGUMENT (the log says what), BAD_STATE (start or f(start) not finite), NO_MEMORY;
+// *out is then NULL.
 TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
                                       tss_reduced **out);
 TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
 // One step; starts from z_t, or from 2 z_t − z_{t−1} where E is lower. Allocates nothing. info may
 // be NULL. Errors: none; how it ended is info.exit, and the state is the best that was found.
 TSS_API tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *info);
-TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);  // at rest in f(z)
+// At rest in f(z). Errors: BAD_STATE (z or f(z) not finite); the state is then as it was.
+TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);
 // Force on each coordinate, N, until changed; copied. NULL: none.
 TSS_API void tss_reduced_set_force(tss_reduced *s, const double *force);
 TSS_API const double *tss_reduced_z(const tss_reduced *s);  // r
@@ -3116,7 +3118,11 @@ tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def, 
         tss_reduced_destroy(s);
         return TSS_ERROR_NO_MEMORY;
     }
-    tss_reduced_set(s, def->start ? def->start : s->z);
+    tss_result r = tss_reduced_set(s, def->start ? def->start : s->z);
+    if (r != TSS_OK) {
+        tss_reduced_destroy(s);
+        return tss__n_refuse(&h, r, "reduced solver: start or f(start) is not finite");
+    }
     *out = s;
     return TSS_OK;
 }
@@ -3144,9 +3150,11 @@ static double tss__reduced_energy(tss_reduced *s, const double *z, double *g) {
 tss_result tss_reduced_set(tss_reduced *s, const double *z) {
     for (int i = 0; i < s->r; i++)
         if (!isfinite(z[i])) return TSS_ERROR_BAD_STATE;
+    tss__reduced_energy(s, z, s->g);
+    for (size_t i = 0; i < s->n; i++)
+        if (!isfinite(s->job.p.x[i])) return TSS_ERROR_BAD_STATE;
     if (z != s->z) memcpy(s->z, z, (size_t)s->r * sizeof(double));
     memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
-    tss__reduced_energy(s, s->z, s->g);
     memcpy(s->x, s->job.p.x, s->n * sizeof(double));
     memcpy(s->x_last, s->x, s->n * sizeof(double));
     return TSS_OK;

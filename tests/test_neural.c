@@ -1481,7 +1481,21 @@ static void test_reduced_exits(void **state) {
     d.memory = 5, start[0] = NAN;
     assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_OK);
     assert_int_equal(tss_reduced_set(sim, start), TSS_ERROR_BAD_STATE);
+    // z is finite, f(z) is not: nothing changes either.
+    const double far[R] = {1e308, 1e308, -1e308};
+    double x[200];
+    tss_net_parameters(n)[0] = tss_net_parameters(n)[1] = 10;
+    memcpy(x, tss_reduced_x(sim), (size_t)s.coords * sizeof *x);
+    assert_int_equal(tss_reduced_set(sim, far), TSS_ERROR_BAD_STATE);
+    assert_memory_equal(x, tss_reduced_x(sim), (size_t)s.coords * sizeof *x);
+    for (int i = 0; i < R; i++) assert_true(tss_reduced_z(sim)[i] == 0);
     tss_reduced_destroy(sim);
+    d.start = start;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_ERROR_BAD_STATE), assert_null(sim);
+    d.start = far;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_ERROR_BAD_STATE), assert_null(sim);
+    assert_non_null(strstr(logged, "start"));
+    assert_int_equal(held, 0);
     tss_net_destroy(n), scene_free(&s), free(force);
 }
 
