@@ -2142,7 +2142,7 @@ static void tss__lip_max_task(int i, int worker, void *arg) {
     double most = 0;
     for (size_t o = at + 1; o < (size_t)l->batch; o++) {
         double dz = tss__n_gap(l->z + at * r, l->z + o * r, r);
-        double f = dz > 0 ? tss__n_gap(l->phi + at * m, l->phi + o * m, m) / dz : 0;
+        double f = dz == 0 ? 0 : tss__n_gap(l->phi + at * m, l->phi + o * m, m) / dz;
         most = f > most || isnan(f) ? f : most;
     }
     l->loss[i] = most;

@@ -822,6 +822,13 @@ static void test_loss_values(void **state) {
         tss_lipschitz_estimate(dec, s.e, s.work, o, B, z, &estimate);
         assert_true(fabs(loss / lip[o] - 1) < 1e-11 && fabs(estimate / most[o] - 1) < 1e-11);
     }
+    double lost[B * R], estimate;  // a sample that is not finite is not passed over
+    memcpy(lost, z, sizeof lost), lost[R] = NAN;
+    tss_lipschitz_estimate(dec, s.e, s.work, 2, B, lost, &estimate);
+    assert_true(isnan(estimate));
+    memcpy(lost, z, sizeof lost), memcpy(lost + R, lost, R * sizeof *lost);  // the same one twice
+    tss_lipschitz_estimate(dec, s.e, s.work, 2, B, lost, &estimate);
+    assert_true(estimate > 0 && isfinite(estimate));
     tss_loss_unsupervised(dec, s.e, s.work, s.mass, 0.8, 0.6, 0, B, z, 1, &loss, parts, NULL);
     assert_true(fabs(parts[1] / repulsion - 1) < 1e-11);
     assert_true(fabs(parts[0] / ((P[0] + P[1] + P[2] + P[3]) / 4) - 1) < 1e-12);
