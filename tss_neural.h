@@ -280,8 +280,8 @@ TSS_API tss_cubature_def tss_cubature_def_default(void);
 // z: samples × r, of the initial subspace; each counts alike (its equations are divided by the norm
 // of its gradient). subset and weight: room for def.count; ascending cells of e and w_e > 0, ready
 // for tss_elements_def. *count: cells chosen; *error (NULL allowed): ‖Σ w_e g_e − g‖ / ‖g‖ over the
-// samples. Cost: chosen · candidates · samples · r, and as much as memory. Errors: BAD_ARGUMENT,
-// NO_MEMORY.
+// samples. Cost: chosen · candidates · samples · r, and as much as memory. Errors: BAD_ARGUMENT
+// (a gradient that is not finite, too), NO_MEMORY.
 TSS_API tss_result tss_cubature_select(const tss_net *decoder, const tss_elements *e,
                                        tss_work *work, const tss_cubature_def *def, int samples,
                                        const double *z, int *subset, double *weight, int *count,
@@ -2413,6 +2413,8 @@ tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work
     tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
     tss__cub_draw(&c, e, def->seed);
     tss_result result = tss__cub_system(&c, n, e, w, samples, z, x, D);
+    if (result == TSS_OK && !isfinite(tss__dot_n((int)c.m, c.b, c.b)))
+        result = TSS_ERROR_BAD_ARGUMENT;
     if (result == TSS_OK) {
         double left = tss__cub_run(&c, def->tol);
         if (error) *error = left;

@@ -1338,6 +1338,9 @@ static void test_cubature(void **state) {
         d.count = 0;
         assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
                          TSS_ERROR_BAD_ARGUMENT);
+        d.count = 5, z[R] = NAN;  // not "no cell, no error"
+        assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
+                         TSS_ERROR_BAD_ARGUMENT);
         tss_net_destroy(n), scene_free(&s), free(z), free(fresh);
     }
 }
