@@ -381,7 +381,7 @@ typedef struct tss_training_info {
     double parts[2];   // unsupervised: potential, repulsion
     double lipschitz;  // L_LS of the batch (its estimate), 0 before it is on
     double rate;
-    int skipped;  // 1: the gradient was not finite, and θ stays as it was
+    int skipped;  // 1: the gradient or its square was not finite, and θ stays as it was
 } tss_training_info;
 
 typedef struct tss_training tss_training;  // opaque: scratch; the state is the model's
@@ -3016,7 +3016,8 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
         m->rng = before;
         return r;
     }
-    for (size_t i = 0; i < t->dec + t->enc; i++) info.skipped |= !isfinite(t->g[i]);
+    // Squares, for the second moments: an infinite one would stay.
+    for (size_t i = 0; i < t->dec + t->enc; i++) info.skipped |= !isfinite(t->g[i] * t->g[i]);
     info.rate = tss_adam_rate(m->adam);
     if (!info.skipped) {
         tss_adam_update(m->adam, 0, t->dec, m->decoder->par, t->g);

@@ -1135,6 +1135,29 @@ static void test_resume(void **state) {
     free(frames), scene_free(&s);
 }
 
+// A gradient whose square overflows is skipped like one that is not finite: moments stay finite,
+// and what is saved can be loaded.
+static void test_huge_gradient(void **state) {
+    (void)state;
+    scene s;
+    tss_model m, copy;
+    tss_training *t;
+    tss_training_info info;
+    scene_make(&s, 2, 2, 1, 0);
+    double *frames = randoms((size_t)(20 * s.coords), 1);
+    for (int i = 0; i < s.coords; i++) s.mass[i] = 1e200;
+    model_of(&s, 1, &m);
+    tss_training_def d = training_of(&s, &m, frames);
+    assert_int_equal(tss_training_create(NULL, &d, &t), TSS_OK);
+    assert_int_equal(tss_training_step(t, &info), TSS_OK);
+    assert_true(info.skipped && isfinite(info.loss));
+    size_t size;
+    unsigned char *p = saved(&m, &size);
+    assert_int_equal(tss_model_load(NULL, p, size, &copy, NULL, 0), TSS_OK);
+    tss_training_destroy(t), tss_model_free(&m), tss_model_free(&copy);
+    free(p), free(frames), scene_free(&s);
+}
+
 // ---- errors ---------------------------------------------------------------------------------
 
 static char logged[1024];
@@ -1664,6 +1687,7 @@ int main(void) {
         T(test_density),      T(test_reduced),        T(test_losses),        T(test_loss_values),
         T(test_unbiased),     T(test_threads),        T(test_adam),          T(test_files),
         T(test_paths),        T(test_resume),         T(test_refusals),      T(test_no_memory),
+        T(test_huge_gradient),
         T(test_cubature),     T(test_reduced_solver), T(test_reduced_exits), T(test_autoencoder),
         T(test_unsupervised),
     };
