@@ -2877,6 +2877,7 @@ static const char *tss__training_complaint(const tss_training_def *d) {
     if (!m || !m->decoder) return "training: no decoder";
     const tss_net *dec = m->decoder, *enc = m->encoder;
     int lip = d->lipschitz_weight != 0;
+    if (dec->has_in) return "training: the decoder has an in_matrix";
     if (enc && (enc->outputs != dec->inputs || enc->inputs != dec->outputs))
         return "training: encoder and decoder do not fit each other";
     if (enc && (!d->frames || d->frame_count < 1)) return "training: an encoder, but no frames";

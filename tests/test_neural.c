@@ -1221,6 +1221,18 @@ static void test_refusals(void **state) {
     tss_training_def td = tss_training_def_default();
     assert_int_equal(tss_training_create(&h, &td, &t), TSS_ERROR_BAD_ARGUMENT);
     assert_non_null(strstr(logged, "decoder"));
+    // A decoder with a first map has no place in training: said at once, not by each step.
+    double *frames = randoms((size_t)(20 * s.coords), 1);
+    int wide[3] = {8, 3, 8};
+    tss_model m;
+    model_of(&s, 1, &m), tss_net_destroy(m.decoder);
+    d = good, d.width = wide, d.inputs = 3, d.in_matrix = frames, d.outputs = s.coords;
+    wide[2] = s.coords;
+    assert_int_equal(tss_net_create(NULL, &d, &m.decoder), TSS_OK);
+    td = training_of(&s, &m, frames), td.elements = NULL, td.lipschitz_weight = 0;
+    assert_int_equal(tss_training_create(&h, &td, &t), TSS_ERROR_BAD_ARGUMENT), assert_null(t);
+    assert_non_null(strstr(logged, "in_matrix"));
+    tss_model_free(&m), free(frames);
     tss_net_destroy(n), scene_free(&s);
 }
 
