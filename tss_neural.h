@@ -3005,7 +3005,7 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
     tss_model *m = d->model;
     tss_training_info info;
     tss_rng before = m->rng;
-    double ramp = 1;
+    double ramp = 1, scale = m->decoder->scale;
     memset(&info, 0, sizeof info);
     if (m->step < d->ramp) ramp = (double)(m->step + 1) / (double)d->ramp;
     if (d->ramp) tss_net_set_scale(m->decoder, ramp);
@@ -3015,6 +3015,7 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
         r = tss__training_lipschitz(t, &info);
     if (r != TSS_OK) {  // as if it had not been called
         m->rng = before;
+        tss_net_set_scale(m->decoder, scale);
         return r;
     }
     // Squares, for the second moments: an infinite one would stay.

@@ -1285,6 +1285,20 @@ static void test_no_memory(void **state) {
         assert_int_equal(held, 0);
     }
     assert_true(done && failures > 8);
+    // A step without memory is as if it had not been called, the ramp's scale included.
+    size_t size2;
+    tss_training *t;
+    model_of(&s, 0, &m);
+    tss_training_def d = training_of(&s, &m, NULL);
+    allowance = 1000;
+    assert_int_equal(tss_training_create(&h, &d, &t), TSS_OK);
+    unsigned char *before = saved(&m, &size), *after;
+    allowance = 0;
+    assert_int_equal(tss_training_step(t, NULL), TSS_ERROR_NO_MEMORY);
+    after = saved(&m, &size2);
+    assert_int_equal(size, size2), assert_memory_equal(before, after, size);
+    tss_training_destroy(t), tss_model_free(&m), free(before), free(after);
+    assert_int_equal(held, 0);
     free(p), free(frames), scene_free(&s);
 }
 
