@@ -105,7 +105,7 @@ typedef struct tss_net_def {
     int outputs;
     const double *out_base, *out_matrix;
     const int *out_index;
-    double out_scale;  // s, finite; default 1. Not with out_matrix
+    double out_scale;  // s, finite; default 1. Not with out_matrix, nor with outputs 0
     int cookie;
 } tss_net_def;
 TSS_API tss_net_def tss_net_def_default(void);
@@ -128,7 +128,7 @@ typedef struct tss_net_info {
 TSS_API void tss_net_get_info(const tss_net *net, tss_net_info *out);
 // θ, to read and to write; layout under CONVENTIONS. Owned by the net.
 TSS_API double *tss_net_parameters(tss_net *net);
-TSS_API void tss_net_set_scale(tss_net *net, double s);  // out_scale
+TSS_API void tss_net_set_scale(tss_net *net, double s);  // out_scale, where there is one
 
 // Threads are the host's of tss_work. Errors: NO_MEMORY.
 TSS_API tss_result tss_work_create(const tss_host *host, tss_work **out);
@@ -720,6 +720,8 @@ static const char *tss__net_complaint(const tss_net_def *d) {
     if (d->outputs == 0 && (d->out_matrix || d->out_index || d->out_base))
         return "network: an outer layer without outputs";
     if (!isfinite(d->out_scale)) return "network: out_scale is not finite";
+    if (d->out_scale != 1 && (d->out_matrix || d->outputs == 0))
+        return "network: out_scale needs outputs, and no out_matrix";
     if (d->outputs == 0 || d->out_matrix) return NULL;
     if (!d->out_index && d->outputs != last) return "network: outputs differ from the last width";
     for (int i = 0; d->out_index && i < last; i++)

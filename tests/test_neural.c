@@ -1185,6 +1185,8 @@ static void test_refusals(void **state) {
     REFUSED(d.width = NULL, "widths");
     REFUSED(d.activation = TSS_ACTIVATIONS, "activation");
     REFUSED(d.out_scale = NAN, "out_scale");
+    REFUSED(d.out_scale = 0.5, "out_scale");  // no outputs: it would be ignored
+    REFUSED((d.out_scale = 0.5, d.out_matrix = s.X, d.outputs = 2), "out_scale");
     REFUSED(d.outputs = 5, "last width");
     REFUSED((d.outputs = 5, d.out_index = index), "twice");
     REFUSED((d.outputs = 2, d.out_index = index), "out of range");
