@@ -335,7 +335,7 @@ typedef struct tss_model {  // start from zeros
 TSS_API void tss_model_free(tss_model *m);  // destroys the parts, leaves zeros
 
 // Bytes that the model takes; written to data if size suffices (data NULL: the size only; 0: size
-// too small, or no decoder).
+// too small, no decoder, or a number that is not finite: no reader would take it).
 TSS_API size_t tss_model_save(const tss_model *m, void *data, size_t size);
 // *out is overwritten; on an error zeros, and why (NULL allowed, why_size bytes) says what is
 // wrong. Nothing is believed: sizes are checked against the bytes there are before memory is taken.
@@ -2527,6 +2527,7 @@ tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restart) {
 typedef struct tss__n_out {  // p NULL: counting
     unsigned char *p;
     size_t at;
+    int bad;  // a number was not finite
 } tss__n_out;
 
 static void tss__put(tss__n_out *o, uint64_t x) {
@@ -2539,6 +2540,7 @@ static void tss__put_doubles(tss__n_out *o, const double *x, size_t count) {
         uint64_t bits;
         memcpy(&bits, x + i, 8);
         tss__put(o, bits);
+        o->bad |= !isfinite(x[i]);
     }
 }
 
@@ -2577,7 +2579,7 @@ static void tss__put_adam(tss__n_out *o, const tss_adam *a) {
 }
 
 static size_t tss__put_model(const tss_model *m, unsigned char *data, uint64_t bytes) {
-    tss__n_out o = {data, 0};
+    tss__n_out o = {data, 0, 0};
     tss__put(&o, TSS__MODEL_MAGIC), tss__put(&o, TSS__MODEL_VERSION), tss__put(&o, bytes);
     tss__put(&o, 0);
     tss__put(&o, (m->encoder ? 1u : 0u) | (m->adam ? 2u : 0u));
@@ -2586,17 +2588,17 @@ static size_t tss__put_model(const tss_model *m, unsigned char *data, uint64_t b
     tss__put_net(&o, m->decoder);
     if (m->encoder) tss__put_net(&o, m->encoder);
     if (m->adam) tss__put_adam(&o, m->adam);
-    return o.at;
+    return o.bad ? 0 : o.at;
 }
 
 size_t tss_model_save(const tss_model *m, void *data, size_t size) {
     if (!m->decoder) return 0;
     size_t need = tss__put_model(m, NULL, 0);
     if (!data) return need;
-    if (size < need) return 0;
+    if (!need || size < need) return 0;
     unsigned char *p = (unsigned char *)data;
     tss__put_model(m, p, need);
-    tss__n_out at = {p, 24};
+    tss__n_out at = {p, 24, 0};
     tss__put(&at, tss__model_sum(p, need));
     return need;
 }

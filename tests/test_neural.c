@@ -1068,6 +1068,13 @@ static void test_paths(void **state) {
     assert_int_equal(tss_model_write(NULL, &m, path), TSS_OK);  // over the old one
     assert_int_equal(tss_model_read(NULL, path, &copy, why, sizeof why), TSS_OK);
     assert_int_equal(copy.step, 12);
+    // What a reader would refuse is not written, and the old file stays.
+    double *theta = tss_net_parameters(m.decoder), kept = theta[0];
+    theta[0] = NAN;
+    assert_int_equal(tss_model_save(&m, NULL, 0), 0);
+    assert_int_equal(tss_model_write(NULL, &m, path), TSS_ERROR_BAD_ARGUMENT);
+    theta[0] = kept, tss_model_free(&copy);
+    assert_int_equal(tss_model_read(NULL, path, &copy, why, sizeof why), TSS_OK);
     size_t a, b;
     unsigned char *p = saved(&m, &a), *q = saved(&copy, &b);
     assert_int_equal(a, b), assert_memory_equal(p, q, a);
