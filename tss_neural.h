@@ -2283,7 +2283,7 @@ static void tss__cub_weights(tss__cub *c) {
         tss__cub_solve(c);
         for (int i = 0; i < c->chosen; i++)
             if (c->s[i] <= 0 && c->w[i] <= t * (c->w[i] - c->s[i]))
-                t = c->w[i] / (c->w[i] - c->s[i]), block = i;
+                t = c->w[i] > 0 ? c->w[i] / (c->w[i] - c->s[i]) : 0, block = i;
         for (int i = 0; i < c->chosen; i++) c->w[i] += t * (c->s[i] - c->w[i]);
         if (block < 0) return;
         c->w[block] = 0;

@@ -1403,6 +1403,21 @@ static void test_cubature(void **state) {
     }
 }
 
+// A new cell whose least-squares weight is exactly 0 leaves; those before it stay (0/0 otherwise).
+static void test_cubature_tie(void **state) {
+    (void)state;
+    double A[4] = {1, 0, 0, 1}, factor[4] = {1, 0, 0, 1}, rhs[2] = {5, 0}, w[2] = {5, 0}, s[2];
+    int in[2] = {0, 1};
+    uint8_t out[2] = {1, 1};
+    tss__cub c;
+    memset(&c, 0, sizeof c);
+    c.most = c.chosen = 2, c.A = A, c.L = factor, c.rhs = rhs, c.w = w, c.s = s;
+    c.in = in, c.out = out;
+    tss__cub_weights(&c);
+    assert_int_equal(c.chosen, 1);
+    assert_true(in[0] == 0 && w[0] == 5 && out[0] == 1 && out[1] == 0);
+}
+
 // ---- reduced solver -------------------------------------------------------------------------
 
 // z moves every free coordinate by itself: Eq. (2) is then the full-space problem.
@@ -1722,7 +1737,7 @@ int main(void) {
         T(test_density),      T(test_reduced),        T(test_losses),        T(test_loss_values),
         T(test_unbiased),     T(test_threads),        T(test_adam),          T(test_files),
         T(test_paths),        T(test_resume),         T(test_refusals),      T(test_no_memory),
-        T(test_huge_gradient),
+        T(test_huge_gradient), T(test_cubature_tie),
         T(test_cubature),     T(test_reduced_solver), T(test_reduced_exits), T(test_autoencoder),
         T(test_unsupervised),
     };
