@@ -105,7 +105,7 @@ typedef struct tss_net_def {
     int outputs;
     const double *out_base, *out_matrix;
     const int *out_index;
-    double out_scale;  // s, finite; default 1. Not with out_matrix
+    double out_scale;  // s, finite; default 1. Not with out_matrix, nor with outputs 0
     int cookie;
 } tss_net_def;
 TSS_API tss_net_def tss_net_def_default(void);
@@ -128,7 +128,7 @@ typedef struct tss_net_info {
 TSS_API void tss_net_get_info(const tss_net *net, tss_net_info *out);
 // θ, to read and to write; layout under CONVENTIONS. Owned by the net.
 TSS_API double *tss_net_parameters(tss_net *net);
-TSS_API void tss_net_set_scale(tss_net *net, double s);  // out_scale
+TSS_API void tss_net_set_scale(tss_net *net, double s);  // out_scale, where there is one
 
 // Threads are the host's of tss_work. Errors: NO_MEMORY.
 TSS_API tss_result tss_work_create(const tss_host *host, tss_work **out);
@@ -280,8 +280,8 @@ TSS_API tss_cubature_def tss_cubature_def_default(void);
 // z: samples × r, of the initial subspace; each counts alike (its equations are divided by the norm
 // of its gradient). subset and weight: room for def.count; ascending cells of e and w_e > 0, ready
 // for tss_elements_def. *count: cells chosen; *error (NULL allowed): ‖Σ w_e g_e − g‖ / ‖g‖ over the
-// samples. Cost: chosen · candidates · samples · r, and as much as memory. Errors: BAD_ARGUMENT,
-// NO_MEMORY.
+// samples. Cost: chosen · candidates · samples · r, and as much as memory. Errors: BAD_ARGUMENT
+// (a gradient that is not finite, too), NO_MEMORY.
 TSS_API tss_result tss_cubature_select(const tss_net *decoder, const tss_elements *e,
                                        tss_work *work, const tss_cubature_def *def, int samples,
                                        const double *z, int *subset, double *weight, int *count,
@@ -335,7 +335,7 @@ typedef struct tss_model {  // start from zeros
 TSS_API void tss_model_free(tss_model *m);  // destroys the parts, leaves zeros
 
 // Bytes that the model takes; written to data if size suffices (data NULL: the size only; 0: size
-// too small, or no decoder).
+// too small, no decoder, or a number that is not finite: no reader would take it).
 TSS_API size_t tss_model_save(const tss_model *m, void *data, size_t size);
 // *out is overwritten; on an error zeros, and why (NULL allowed, why_size bytes) says what is
 // wrong. Nothing is believed: sizes are checked against the bytes there are before memory is taken.
@@ -381,7 +381,7 @@ typedef struct tss_training_info {
     double parts[2];   // unsupervised: potential, repulsion
     double lipschitz;  // L_LS of the batch (its estimate), 0 before it is on
     double rate;
-    int skipped;  // 1: the gradient was not finite, and θ stays as it was
+    int skipped;  // 1: the gradient or its square was not finite, and θ stays as it was
 } tss_training_info;
 
 typedef struct tss_training tss_training;  // opaque: scratch; the state is the model's
@@ -428,14 +428,16 @@ typedef struct tss_reduced_info {
 } tss_reduced_info;
 
 typedef struct tss_reduced tss_reduced;  // opaque
-// Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+// Errors: BAD_ARGUMENT (the log says what), BAD_STATE (start or f(start) not finite), NO_MEMORY;
+// *out is then NULL.
 TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
                                       tss_reduced **out);
 TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
 // One step; starts from z_t, or from 2 z_t − z_{t−1} where E is lower. Allocates nothing. info may
 // be NULL. Errors: none; how it ended is info.exit, and the state is the best that was found.
 TSS_API tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *info);
-TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);  // at rest in f(z)
+// At rest in f(z). Errors: BAD_STATE (z or f(z) not finite); the state is then as it was.
+TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);
 // Force on each coordinate, N, until changed; copied. NULL: none.
 TSS_API void tss_reduced_set_force(tss_reduced *s, const double *force);
 TSS_API const double *tss_reduced_z(const tss_reduced *s);  // r
@@ -718,6 +720,8 @@ static const char *tss__net_complaint(const tss_net_def *d) {
     if (d->outputs == 0 && (d->out_matrix || d->out_index || d->out_base))
         return "network: an outer layer without outputs";
     if (!isfinite(d->out_scale)) return "network: out_scale is not finite";
+    if (d->out_scale != 1 && (d->out_matrix || d->outputs == 0))
+        return "network: out_scale needs outputs, and no out_matrix";
     if (d->outputs == 0 || d->out_matrix) return NULL;
     if (!d->out_index && d->outputs != last) return "network: outputs differ from the last width";
     for (int i = 0; d->out_index && i < last; i++)
@@ -2140,7 +2144,7 @@ static void tss__lip_max_task(int i, int worker, void *arg) {
     double most = 0;
     for (size_t o = at + 1; o < (size_t)l->batch; o++) {
         double dz = tss__n_gap(l->z + at * r, l->z + o * r, r);
-        double f = dz > 0 ? tss__n_gap(l->phi + at * m, l->phi + o * m, m) / dz : 0;
+        double f = dz == 0 ? 0 : tss__n_gap(l->phi + at * m, l->phi + o * m, m) / dz;
         most = f > most || isnan(f) ? f : most;
     }
     l->loss[i] = most;
@@ -2279,7 +2283,7 @@ static void tss__cub_weights(tss__cub *c) {
         tss__cub_solve(c);
         for (int i = 0; i < c->chosen; i++)
             if (c->s[i] <= 0 && c->w[i] <= t * (c->w[i] - c->s[i]))
-                t = c->w[i] / (c->w[i] - c->s[i]), block = i;
+                t = c->w[i] > 0 ? c->w[i] / (c->w[i] - c->s[i]) : 0, block = i;
         for (int i = 0; i < c->chosen; i++) c->w[i] += t * (c->s[i] - c->w[i]);
         if (block < 0) return;
         c->w[block] = 0;
@@ -2411,6 +2415,8 @@ tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work
     tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
     tss__cub_draw(&c, e, def->seed);
     tss_result result = tss__cub_system(&c, n, e, w, samples, z, x, D);
+    if (result == TSS_OK && !isfinite(tss__dot_n((int)c.m, c.b, c.b)))
+        result = TSS_ERROR_BAD_ARGUMENT;
     if (result == TSS_OK) {
         double left = tss__cub_run(&c, def->tol);
         if (error) *error = left;
@@ -2521,6 +2527,7 @@ tss_result tss_adam_set(tss_adam *a, const tss_adam_def *def, int restart) {
 typedef struct tss__n_out {  // p NULL: counting
     unsigned char *p;
     size_t at;
+    int bad;  // a number was not finite
 } tss__n_out;
 
 static void tss__put(tss__n_out *o, uint64_t x) {
@@ -2533,6 +2540,7 @@ static void tss__put_doubles(tss__n_out *o, const double *x, size_t count) {
         uint64_t bits;
         memcpy(&bits, x + i, 8);
         tss__put(o, bits);
+        o->bad |= !isfinite(x[i]);
     }
 }
 
@@ -2571,7 +2579,7 @@ static void tss__put_adam(tss__n_out *o, const tss_adam *a) {
 }
 
 static size_t tss__put_model(const tss_model *m, unsigned char *data, uint64_t bytes) {
-    tss__n_out o = {data, 0};
+    tss__n_out o = {data, 0, 0};
     tss__put(&o, TSS__MODEL_MAGIC), tss__put(&o, TSS__MODEL_VERSION), tss__put(&o, bytes);
     tss__put(&o, 0);
     tss__put(&o, (m->encoder ? 1u : 0u) | (m->adam ? 2u : 0u));
@@ -2580,17 +2588,17 @@ static size_t tss__put_model(const tss_model *m, unsigned char *data, uint64_t b
     tss__put_net(&o, m->decoder);
     if (m->encoder) tss__put_net(&o, m->encoder);
     if (m->adam) tss__put_adam(&o, m->adam);
-    return o.at;
+    return o.bad ? 0 : o.at;
 }
 
 size_t tss_model_save(const tss_model *m, void *data, size_t size) {
     if (!m->decoder) return 0;
     size_t need = tss__put_model(m, NULL, 0);
     if (!data) return need;
-    if (size < need) return 0;
+    if (!need || size < need) return 0;
     unsigned char *p = (unsigned char *)data;
     tss__put_model(m, p, need);
-    tss__n_out at = {p, 24};
+    tss__n_out at = {p, 24, 0};
     tss__put(&at, tss__model_sum(p, need));
     return need;
 }
@@ -2873,6 +2881,7 @@ static const char *tss__training_complaint(const tss_training_def *d) {
     if (!m || !m->decoder) return "training: no decoder";
     const tss_net *dec = m->decoder, *enc = m->encoder;
     int lip = d->lipschitz_weight != 0;
+    if (dec->has_in) return "training: the decoder has an in_matrix";
     if (enc && (enc->outputs != dec->inputs || enc->inputs != dec->outputs))
         return "training: encoder and decoder do not fit each other";
     if (enc && (!d->frames || d->frame_count < 1)) return "training: an encoder, but no frames";
@@ -3000,7 +3009,7 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
     tss_model *m = d->model;
     tss_training_info info;
     tss_rng before = m->rng;
-    double ramp = 1;
+    double ramp = 1, scale = m->decoder->scale;
     memset(&info, 0, sizeof info);
     if (m->step < d->ramp) ramp = (double)(m->step + 1) / (double)d->ramp;
     if (d->ramp) tss_net_set_scale(m->decoder, ramp);
@@ -3010,9 +3019,11 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
         r = tss__training_lipschitz(t, &info);
     if (r != TSS_OK) {  // as if it had not been called
         m->rng = before;
+        tss_net_set_scale(m->decoder, scale);
         return r;
     }
-    for (size_t i = 0; i < t->dec + t->enc; i++) info.skipped |= !isfinite(t->g[i]);
+    // Squares, for the second moments: an infinite one would stay.
+    for (size_t i = 0; i < t->dec + t->enc; i++) info.skipped |= !isfinite(t->g[i] * t->g[i]);
     info.rate = tss_adam_rate(m->adam);
     if (!info.skipped) {
         tss_adam_update(m->adam, 0, t->dec, m->decoder->par, t->g);
@@ -3116,7 +3127,11 @@ tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def, 
         tss_reduced_destroy(s);
         return TSS_ERROR_NO_MEMORY;
     }
-    tss_reduced_set(s, def->start ? def->start : s->z);
+    tss_result r = tss_reduced_set(s, def->start ? def->start : s->z);
+    if (r != TSS_OK) {
+        tss_reduced_destroy(s);
+        return tss__n_refuse(&h, r, "reduced solver: start or f(start) is not finite");
+    }
     *out = s;
     return TSS_OK;
 }
@@ -3144,9 +3159,11 @@ static double tss__reduced_energy(tss_reduced *s, const double *z, double *g) {
 tss_result tss_reduced_set(tss_reduced *s, const double *z) {
     for (int i = 0; i < s->r; i++)
         if (!isfinite(z[i])) return TSS_ERROR_BAD_STATE;
+    tss__reduced_energy(s, z, s->g);
+    for (size_t i = 0; i < s->n; i++)
+        if (!isfinite(s->job.p.x[i])) return TSS_ERROR_BAD_STATE;
     if (z != s->z) memcpy(s->z, z, (size_t)s->r * sizeof(double));
     memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
-    tss__reduced_energy(s, s->z, s->g);
     memcpy(s->x, s->job.p.x, s->n * sizeof(double));
     memcpy(s->x_last, s->x, s->n * sizeof(double));
     return TSS_OK;
@@ -3240,7 +3257,10 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
         memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
         s->energy = E, s->current = 1;
         if (tss__n_largest(s->g, s->r) <= s->def.eps) continue;  // counted as converged
-        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) return TSS_EXIT_SADDLE;
+        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) {
+            ++*iterations;  // this one
+            return TSS_EXIT_SADDLE;
+        }
     }
 }
 

@@ -822,6 +822,13 @@ static void test_loss_values(void **state) {
         tss_lipschitz_estimate(dec, s.e, s.work, o, B, z, &estimate);
         assert_true(fabs(loss / lip[o] - 1) < 1e-11 && fabs(estimate / most[o] - 1) < 1e-11);
     }
+    double lost[B * R], estimate;  // a sample that is not finite is not passed over
+    memcpy(lost, z, sizeof lost), lost[R] = NAN;
+    tss_lipschitz_estimate(dec, s.e, s.work, 2, B, lost, &estimate);
+    assert_true(isnan(estimate));
+    memcpy(lost, z, sizeof lost), memcpy(lost + R, lost, R * sizeof *lost);  // the same one twice
+    tss_lipschitz_estimate(dec, s.e, s.work, 2, B, lost, &estimate);
+    assert_true(estimate > 0 && isfinite(estimate));
     tss_loss_unsupervised(dec, s.e, s.work, s.mass, 0.8, 0.6, 0, B, z, 1, &loss, parts, NULL);
     assert_true(fabs(parts[1] / repulsion - 1) < 1e-11);
     assert_true(fabs(parts[0] / ((P[0] + P[1] + P[2] + P[3]) / 4) - 1) < 1e-12);
@@ -1061,6 +1068,13 @@ static void test_paths(void **state) {
     assert_int_equal(tss_model_write(NULL, &m, path), TSS_OK);  // over the old one
     assert_int_equal(tss_model_read(NULL, path, &copy, why, sizeof why), TSS_OK);
     assert_int_equal(copy.step, 12);
+    // What a reader would refuse is not written, and the old file stays.
+    double *theta = tss_net_parameters(m.decoder), kept = theta[0];
+    theta[0] = NAN;
+    assert_int_equal(tss_model_save(&m, NULL, 0), 0);
+    assert_int_equal(tss_model_write(NULL, &m, path), TSS_ERROR_BAD_ARGUMENT);
+    theta[0] = kept, tss_model_free(&copy);
+    assert_int_equal(tss_model_read(NULL, path, &copy, why, sizeof why), TSS_OK);
     size_t a, b;
     unsigned char *p = saved(&m, &a), *q = saved(&copy, &b);
     assert_int_equal(a, b), assert_memory_equal(p, q, a);
@@ -1128,6 +1142,29 @@ static void test_resume(void **state) {
     free(frames), scene_free(&s);
 }
 
+// A gradient whose square overflows is skipped like one that is not finite: moments stay finite,
+// and what is saved can be loaded.
+static void test_huge_gradient(void **state) {
+    (void)state;
+    scene s;
+    tss_model m, copy;
+    tss_training *t;
+    tss_training_info info;
+    scene_make(&s, 2, 2, 1, 0);
+    double *frames = randoms((size_t)(20 * s.coords), 1);
+    for (int i = 0; i < s.coords; i++) s.mass[i] = 1e200;
+    model_of(&s, 1, &m);
+    tss_training_def d = training_of(&s, &m, frames);
+    assert_int_equal(tss_training_create(NULL, &d, &t), TSS_OK);
+    assert_int_equal(tss_training_step(t, &info), TSS_OK);
+    assert_true(info.skipped && isfinite(info.loss));
+    size_t size;
+    unsigned char *p = saved(&m, &size);
+    assert_int_equal(tss_model_load(NULL, p, size, &copy, NULL, 0), TSS_OK);
+    tss_training_destroy(t), tss_model_free(&m), tss_model_free(&copy);
+    free(p), free(frames), scene_free(&s);
+}
+
 // ---- errors ---------------------------------------------------------------------------------
 
 static char logged[1024];
@@ -1155,6 +1192,8 @@ static void test_refusals(void **state) {
     REFUSED(d.width = NULL, "widths");
     REFUSED(d.activation = TSS_ACTIVATIONS, "activation");
     REFUSED(d.out_scale = NAN, "out_scale");
+    REFUSED(d.out_scale = 0.5, "out_scale");  // no outputs: it would be ignored
+    REFUSED((d.out_scale = 0.5, d.out_matrix = s.X, d.outputs = 2), "out_scale");
     REFUSED(d.outputs = 5, "last width");
     REFUSED((d.outputs = 5, d.out_index = index), "twice");
     REFUSED((d.outputs = 2, d.out_index = index), "out of range");
@@ -1191,6 +1230,18 @@ static void test_refusals(void **state) {
     tss_training_def td = tss_training_def_default();
     assert_int_equal(tss_training_create(&h, &td, &t), TSS_ERROR_BAD_ARGUMENT);
     assert_non_null(strstr(logged, "decoder"));
+    // A decoder with a first map has no place in training: said at once, not by each step.
+    double *frames = randoms((size_t)(20 * s.coords), 1);
+    int wide[3] = {8, 3, 8};
+    tss_model m;
+    model_of(&s, 1, &m), tss_net_destroy(m.decoder);
+    d = good, d.width = wide, d.inputs = 3, d.in_matrix = frames, d.outputs = s.coords;
+    wide[2] = s.coords;
+    assert_int_equal(tss_net_create(NULL, &d, &m.decoder), TSS_OK);
+    td = training_of(&s, &m, frames), td.elements = NULL, td.lipschitz_weight = 0;
+    assert_int_equal(tss_training_create(&h, &td, &t), TSS_ERROR_BAD_ARGUMENT), assert_null(t);
+    assert_non_null(strstr(logged, "in_matrix"));
+    tss_model_free(&m), free(frames);
     tss_net_destroy(n), scene_free(&s);
 }
 
@@ -1243,6 +1294,20 @@ static void test_no_memory(void **state) {
         assert_int_equal(held, 0);
     }
     assert_true(done && failures > 8);
+    // A step without memory is as if it had not been called, the ramp's scale included.
+    size_t size2;
+    tss_training *t;
+    model_of(&s, 0, &m);
+    tss_training_def d = training_of(&s, &m, NULL);
+    allowance = 1000;
+    assert_int_equal(tss_training_create(&h, &d, &t), TSS_OK);
+    unsigned char *before = saved(&m, &size), *after;
+    allowance = 0;
+    assert_int_equal(tss_training_step(t, NULL), TSS_ERROR_NO_MEMORY);
+    after = saved(&m, &size2);
+    assert_int_equal(size, size2), assert_memory_equal(before, after, size);
+    tss_training_destroy(t), tss_model_free(&m), free(before), free(after);
+    assert_int_equal(held, 0);
     free(p), free(frames), scene_free(&s);
 }
 
@@ -1331,8 +1396,26 @@ static void test_cubature(void **state) {
         d.count = 0;
         assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
                          TSS_ERROR_BAD_ARGUMENT);
+        d.count = 5, z[R] = NAN;  // not "no cell, no error"
+        assert_int_equal(tss_cubature_select(n, s.e, s.work, &d, N, z, all, w, &count, &error),
+                         TSS_ERROR_BAD_ARGUMENT);
         tss_net_destroy(n), scene_free(&s), free(z), free(fresh);
     }
+}
+
+// A new cell whose least-squares weight is exactly 0 leaves; those before it stay (0/0 otherwise).
+static void test_cubature_tie(void **state) {
+    (void)state;
+    double A[4] = {1, 0, 0, 1}, factor[4] = {1, 0, 0, 1}, rhs[2] = {5, 0}, w[2] = {5, 0}, s[2];
+    int in[2] = {0, 1};
+    uint8_t out[2] = {1, 1};
+    tss__cub c;
+    memset(&c, 0, sizeof c);
+    c.most = c.chosen = 2, c.A = A, c.L = factor, c.rhs = rhs, c.w = w, c.s = s;
+    c.in = in, c.out = out;
+    tss__cub_weights(&c);
+    assert_int_equal(c.chosen, 1);
+    assert_true(in[0] == 0 && w[0] == 5 && out[0] == 1 && out[1] == 0);
 }
 
 // ---- reduced solver -------------------------------------------------------------------------
@@ -1440,7 +1523,8 @@ static void test_reduced_exits(void **state) {
         assert_int_equal(info.exit, kind);
         assert_int_equal(tss_reduced_exits(sim)[kind], 1);
         // What is reported is E and its gradient at z, whatever was tried last.
-        double x[200], z[R], E[3];
+        double x[200], z[R], z_end[R], E[3];
+        memcpy(z_end, tss_reduced_z(sim), sizeof z_end);
         for (int side = -1; side <= 1; side++) {
             for (int i = 0; i < R; i++)
                 z[i] = tss_reduced_z(sim)[i] + (i == kind % R ? 1e-3 * side : 0);
@@ -1459,6 +1543,16 @@ static void test_reduced_exits(void **state) {
             assert_int_equal(tss_reduced_step(sim, NULL), TSS_OK);  // allowance is 0
         tss_reduced_destroy(sim);
         assert_int_equal(held, 0);
+        if (kind != TSS_EXIT_SADDLE && kind != TSS_EXIT_CONVERGED) continue;
+        // So many iterations and no tolerances: the same z.
+        memcpy(z, z_end, sizeof z);
+        d.eps = d.ftol = 0, d.max_iterations = info.iterations, allowance = 100;
+        assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_OK);
+        tss_reduced_set_force(sim, force);
+        assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+        assert_int_equal(info.exit, TSS_EXIT_ITERATIONS);
+        assert_memory_equal(tss_reduced_z(sim), z, sizeof z);
+        tss_reduced_destroy(sim);
     }
     tss_reduced_def d = tss_reduced_def_default();
     tss_reduced *sim;
@@ -1470,7 +1564,21 @@ static void test_reduced_exits(void **state) {
     d.memory = 5, start[0] = NAN;
     assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_OK);
     assert_int_equal(tss_reduced_set(sim, start), TSS_ERROR_BAD_STATE);
+    // z is finite, f(z) is not: nothing changes either.
+    const double far[R] = {1e308, 1e308, -1e308};
+    double x[200];
+    tss_net_parameters(n)[0] = tss_net_parameters(n)[1] = 10;
+    memcpy(x, tss_reduced_x(sim), (size_t)s.coords * sizeof *x);
+    assert_int_equal(tss_reduced_set(sim, far), TSS_ERROR_BAD_STATE);
+    assert_memory_equal(x, tss_reduced_x(sim), (size_t)s.coords * sizeof *x);
+    for (int i = 0; i < R; i++) assert_true(tss_reduced_z(sim)[i] == 0);
     tss_reduced_destroy(sim);
+    d.start = start;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_ERROR_BAD_STATE), assert_null(sim);
+    d.start = far;
+    assert_int_equal(tss_reduced_create(&h, &d, &sim), TSS_ERROR_BAD_STATE), assert_null(sim);
+    assert_non_null(strstr(logged, "start"));
+    assert_int_equal(held, 0);
     tss_net_destroy(n), scene_free(&s), free(force);
 }
 
@@ -1629,6 +1737,7 @@ int main(void) {
         T(test_density),      T(test_reduced),        T(test_losses),        T(test_loss_values),
         T(test_unbiased),     T(test_threads),        T(test_adam),          T(test_files),
         T(test_paths),        T(test_resume),         T(test_refusals),      T(test_no_memory),
+        T(test_huge_gradient), T(test_cubature_tie),
         T(test_cubature),     T(test_reduced_solver), T(test_reduced_exits), T(test_autoencoder),
         T(test_unsupervised),
     };
