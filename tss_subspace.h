@@ -3441,6 +3441,11 @@ static int tss__sub_nonzero(const double *blk, int dd) {
     return size > 0;
 }
 
+// y[0..n) = v · x[0..n)
+static void tss__sub_times(int n, double v, const double *x, double *y) {
+    for (int k = 0; k < n; k++) y[k] = v * x[k];
+}
+
 // y[0..n) += v · x[0..n)
 static void tss__sub_axpy(int n, double v, const double *x, double *y) {
     for (int k = 0; k < n; k++) y[k] += v * x[k];
@@ -3493,29 +3498,30 @@ static void tss__sub_part_stiffness(const tss__sub_run *run, int p, double *K, d
     }
 }
 
-// T (d × a) = K_i U, a row of blocks against rows of phi (ld c) and vec (d × r each).
-static void tss__sub_row_times(int d, int c, int r, const double *blk, const double *phi, const double *vec, double *T) {
+// T (d × a) += K_ij U_j, one block against its node's rows of phi (c) and vec (d × r); first: T = K_ij U_j.
+static void tss__sub_row_times(int d, int c, int r, const double *blk, const double *phi, const double *vec, int first,
+                               double *T) {
     const int a = d * c + r;
     for (int p = 0; p < d; p++)
         for (int q = 0; q < d; q++) {
             double v = blk[p * d + q];
-            if (c > 0) tss__sub_axpy(c, v, phi, T + p * a + q * c);
-            if (r > 0) tss__sub_axpy(r, v, vec + q * r, T + p * a + d * c);
+            if (c > 0) (first ? tss__sub_times : tss__sub_axpy)(c, v, phi, T + p * a + q * c);
+            if (r > 0) (first && q == 0 ? tss__sub_times : tss__sub_axpy)(r, v, vec + q * r, T + p * a + d * c);
         }
 }
 
-// H (a × a_b: rows modes of the T side, columns modes of the row side) += T for count rows: T is
-// count × d × a; phi count × c_b, vec count × d × r_b. lower: a body's own H, blocks above its
+// H (a × a_b: rows modes of the T side, columns modes of the row side) = beta H + T for count rows: T
+// is count × d × a; phi count × c_b, vec count × d × r_b. lower: a body's own H, blocks above its
 // diagonal are left out.
 static void tss__sub_gather(int d, int count, int a, const double *T, int cb, int rb, const double *phi,
-                            const double *vec, int lower, double *H) {
+                            const double *vec, int lower, double beta, double *H) {
     for (int p = 0; p < d; p++) {
         int f = lower ? p * cb : 0, v = lower ? d * cb : 0;  // first row that is wanted
         if (cb > 0)
-            tss_dense_product(0, 1, a - f, cb, count, 1, T + p * a + f, d * a, phi, cb, 1,
+            tss_dense_product(0, 1, a - f, cb, count, 1, T + p * a + f, d * a, phi, cb, beta,
                               H + (size_t)(p * cb) * (size_t)a + f, a);
         if (rb > 0)
-            tss_dense_product(0, 1, a - v, rb, count, 1, T + p * a + v, d * a, vec + p * rb, d * rb, 1,
+            tss_dense_product(0, 1, a - v, rb, count, 1, T + p * a + v, d * a, vec + p * rb, d * rb, p > 0 ? 1 : beta,
                               H + (size_t)(d * cb) * (size_t)a + v, a);
     }
 }
@@ -3554,7 +3560,6 @@ static void tss__sub_hessian_task(int p, int worker, void *arg) {
     double *T = vec + (size_t)t->nodes * (size_t)(d * r), *H = tss__sub_f(&s->secant) + t->h;
     int *local = (int *)(void *)(T + (size_t)t->nodes * (size_t)(d * a)), *kept = local + t->nodes, *at = kept + t->nodes;
     memset(K, 0, (size_t)row[t->nodes] * (size_t)dd * sizeof(double));
-    memset(H, 0, (size_t)a * (size_t)a * sizeof(double));
     tss__sub_part_stiffness(run, p, K, out);
     t->used = 0;  // nodes of held stencils: where much is enriched, few are left
     for (int i = 0; i < t->nodes; i++) {
@@ -3567,14 +3572,18 @@ static void tss__sub_hessian_task(int p, int worker, void *arg) {
         }
         if (at[i] >= 0) kept[t->used++] = node[i];
     }
-    memset(T, 0, (size_t)t->used * (size_t)(d * a) * sizeof(double));
     tss__sub_rows(s, t->modal, kept, t->used, 0, local, phi, vec);
-    for (int i = 0; i < t->nodes; i++)
-        for (int k = row[i]; at[i] >= 0 && k < row[i + 1]; k++)
-            if (at[col[k]] >= 0)
-                tss__sub_row_times(d, c, r, K + (size_t)k * (size_t)dd, phi + (size_t)at[col[k]] * (size_t)c,
-                                   vec + (size_t)at[col[k]] * (size_t)(d * r), T + (size_t)at[i] * (size_t)(d * a));
-    tss__sub_gather(d, t->used, a, T, c, r, phi, vec, 1, H);
+    for (int i = 0; i < t->nodes; i++) {
+        int first = 1;
+        for (int k = row[i]; at[i] >= 0 && k < row[i + 1]; k++) {
+            if (at[col[k]] < 0) continue;
+            tss__sub_row_times(d, c, r, K + (size_t)k * (size_t)dd, phi + (size_t)at[col[k]] * (size_t)c,
+                               vec + (size_t)at[col[k]] * (size_t)(d * r), first, T + (size_t)at[i] * (size_t)(d * a));
+            first = 0;
+        }
+    }
+    if (t->used > 0) tss__sub_gather(d, t->used, a, T, c, r, phi, vec, 1, 0, H);
+    else memset(H, 0, (size_t)a * (size_t)a * sizeof(double));
     t->fresh = 1;
 }
 
@@ -4010,11 +4019,12 @@ typedef struct tss__sub_project {
     size_t lane_each, each;
 } tss__sub_project;
 
-// T (d × a of body) += K_i U over the neighbours in that body.
+// T (d × a of body) = K_i U over the neighbours in that body.
 static void tss__sub_times_row(const tss__sub_project *p, int row, double *T) {
     const tss_subspace *s = p->s;
     const tss__modal *m = tss__sub_modal(s, p->col_body);
     const int d = s->dim, dd = d * d;
+    int first = 1;
     for (int part = 0; part < 2; part++) {
         const tss_bcsr *K = part ? &s->C : &s->A;
         if (!(p->from & (1 << part)) || (!part && !tss__sub_u(&s->live_row)[row])) continue;
@@ -4025,9 +4035,11 @@ static void tss__sub_times_row(const tss__sub_project *p, int row, double *T) {
             if (!tss__sub_nonzero(blk, dd)) continue;
             size_t at = (size_t)tss__sub_i(&s->live_index)[j];
             tss__sub_row_times(d, m->c, m->r, blk, tss__sub_f(&m->phi) + at * (size_t)m->c,
-                               tss__sub_f(&m->vec) + at * (size_t)(d * m->r), T);
+                               tss__sub_f(&m->vec) + at * (size_t)(d * m->r), first, T);
+            first = 0;
         }
     }
+    if (first) memset(T, 0, (size_t)(d * m->a) * sizeof(double));
 }
 
 static void tss__sub_project_task(int lane, int worker, void *arg) {
@@ -4037,10 +4049,8 @@ static void tss__sub_project_task(int lane, int worker, void *arg) {
     const int d = s->dim, a = mc->a, c = mr->c, r = mr->r;
     double *T = p->work + (size_t)worker * p->each, *phi = T + TSS__SUB_CHUNK * d * a;
     double *vec = phi + TSS__SUB_CHUNK * c, *H = p->lane + (size_t)lane * p->lane_each;
-    memset(H, 0, p->lane_each * sizeof(double));
     for (int from = lane * TSS__SUB_CHUNK; from < p->count; from += TSS__SUB_LANES * TSS__SUB_CHUNK) {
         int n = p->count - from < TSS__SUB_CHUNK ? p->count - from : TSS__SUB_CHUNK;
-        memset(T, 0, (size_t)(n * d * a) * sizeof(double));
         for (int i = 0; i < n; i++) {
             int node = p->node[from + i];
             size_t at = (size_t)tss__sub_i(&s->live_index)[node];
@@ -4048,7 +4058,7 @@ static void tss__sub_project_task(int lane, int worker, void *arg) {
             memcpy(phi + i * c, tss__sub_f(&mr->phi) + at * (size_t)c, (size_t)c * sizeof(double));
             memcpy(vec + i * d * r, tss__sub_f(&mr->vec) + at * (size_t)(d * r), (size_t)(d * r) * sizeof(double));
         }
-        tss__sub_gather(d, n, a, T, c, r, phi, vec, p->row_body == p->col_body, H);
+        tss__sub_gather(d, n, a, T, c, r, phi, vec, p->row_body == p->col_body, from > lane * TSS__SUB_CHUNK, H);
     }
 }
 
@@ -4063,9 +4073,15 @@ static tss_result tss__sub_project_rows(tss_subspace *s, const tss_unknowns *u, 
     p.lane = (double *)tss__sub_need(s, &s->lane, TSS__SUB_LANES * p.lane_each, sizeof(double));
     p.work = (double *)tss__sub_need(s, &s->scratch, p.each * (size_t)tss_workers(&s->host), sizeof(double));
     if (!p.lane || !p.work) return tss__sub_no_memory(s);
-    tss_parallel(&s->host, TSS__SUB_LANES, tss__sub_project_task, &p);
-    for (int l = 0; l < TSS__SUB_LANES; l++)
-        for (size_t k = 0; k < p.lane_each; k++) H[k] += p.lane[(size_t)l * p.lane_each + k];
+    int lanes = (count + TSS__SUB_CHUNK - 1) / TSS__SUB_CHUNK;  // those that have rows
+    if (lanes > TSS__SUB_LANES) lanes = TSS__SUB_LANES;
+    tss_parallel(&s->host, lanes, tss__sub_project_task, &p);
+    const size_t height = (size_t)mc->a;
+    for (size_t j = 0; j < (size_t)mb->a; j++)  // of a body's own H the lower triangle
+        for (int l = 0; l < lanes; l++) {
+            const double *from = p.lane + (size_t)l * p.lane_each + j * height;
+            for (size_t i = b == c ? j : 0; i < height; i++) H[j * height + i] += from[i];
+        }
     return TSS_OK;
 }
 
