@@ -3441,11 +3441,6 @@ static int tss__sub_nonzero(const double *blk, int dd) {
     return size > 0;
 }
 
-// y[0..n) = v · x[0..n)
-static void tss__sub_times(int n, double v, const double *x, double *y) {
-    for (int k = 0; k < n; k++) y[k] = v * x[k];
-}
-
 // y[0..n) += v · x[0..n)
 static void tss__sub_axpy(int n, double v, const double *x, double *y) {
     for (int k = 0; k < n; k++) y[k] += v * x[k];
@@ -3498,16 +3493,50 @@ static void tss__sub_part_stiffness(const tss__sub_run *run, int p, double *K, d
     }
 }
 
-// T (d × a) += K_ij U_j, one block against its node's rows of phi (c) and vec (d × r); first: T = K_ij U_j.
-static void tss__sub_row_times(int d, int c, int r, const double *blk, const double *phi, const double *vec, int first,
-                               double *T) {
+// Blocks of one row of K and the rows of U they meet: phi (c) and vec (d × r) of each.
+#define TSS__SUB_ROW 64  // taken at a time
+typedef struct tss__sub_row {
+    int count;
+    const double *blk[TSS__SUB_ROW], *phi[TSS__SUB_ROW], *vec[TSS__SUB_ROW];
+} tss__sub_row;
+
+// T[p·a + k] (+)= Σ blk[3p] phi[k] for eight k and the three p: the sums stay in registers.
+static void tss__sub_row_eight(const tss__sub_row *w, int q, int from, int first, int a, double *T) {
+    tss__lanes t0 = {0}, t1 = {0}, t2 = {0};
+    if (!first) {
+        TSS__EACH_LANE(l) t0[l] = T[l];
+        TSS__EACH_LANE(l) t1[l] = T[a + l];
+        TSS__EACH_LANE(l) t2[l] = T[2 * a + l];
+    }
+    for (int n = 0; n < w->count; n++) {
+        const double *blk = w->blk[n] + q, *phi = w->phi[n] + from;
+        const double v0 = blk[0], v1 = blk[3], v2 = blk[6];
+        TSS__EACH_LANE(l) t0[l] += v0 * phi[l];
+        TSS__EACH_LANE(l) t1[l] += v1 * phi[l];
+        TSS__EACH_LANE(l) t2[l] += v2 * phi[l];
+    }
+    TSS__EACH_LANE(l) T[l] = t0[l];
+    TSS__EACH_LANE(l) T[a + l] = t1[l];
+    TSS__EACH_LANE(l) T[2 * a + l] = t2[l];
+}
+
+// T (d × a) += K_i U over the blocks of w; first: T = K_i U.
+static void tss__sub_row_times(int d, int c, int r, const tss__sub_row *w, int first, double *T) {
     const int a = d * c + r;
-    for (int p = 0; p < d; p++)
-        for (int q = 0; q < d; q++) {
-            double v = blk[p * d + q];
-            if (c > 0) (first ? tss__sub_times : tss__sub_axpy)(c, v, phi, T + p * a + q * c);
-            if (r > 0) (first && q == 0 ? tss__sub_times : tss__sub_axpy)(r, v, vec + q * r, T + p * a + d * c);
-        }
+    const int eights = d == 3 ? c / 8 * 8 : 0;
+    for (int p = 0; first && p < d; p++) {
+        for (int q = 0; q < d; q++) memset(T + p * a + q * c + eights, 0, (size_t)(c - eights) * sizeof(double));
+        memset(T + p * a + d * c, 0, (size_t)r * sizeof(double));
+    }
+    for (int q = 0; q < d; q++)
+        for (int from = 0; from < eights; from += 8) tss__sub_row_eight(w, q, from, first, a, T + q * c + from);
+    for (int n = 0; n < w->count; n++)
+        for (int p = 0; p < d; p++)
+            for (int q = 0; q < d; q++) {
+                double v = w->blk[n][p * d + q];
+                if (eights < c) tss__sub_axpy(c - eights, v, w->phi[n] + eights, T + p * a + q * c + eights);
+                if (r > 0) tss__sub_axpy(r, v, w->vec[n] + q * r, T + p * a + d * c);
+            }
 }
 
 // H (a × a_b: rows modes of the T side, columns modes of the row side) = beta H + T for count rows: T
@@ -3574,12 +3603,18 @@ static void tss__sub_hessian_task(int p, int worker, void *arg) {
     }
     tss__sub_rows(s, t->modal, kept, t->used, 0, local, phi, vec);
     for (int i = 0; i < t->nodes; i++) {
+        tss__sub_row w;
         int first = 1;
+        w.count = 0;
         for (int k = row[i]; at[i] >= 0 && k < row[i + 1]; k++) {
-            if (at[col[k]] < 0) continue;
-            tss__sub_row_times(d, c, r, K + (size_t)k * (size_t)dd, phi + (size_t)at[col[k]] * (size_t)c,
-                               vec + (size_t)at[col[k]] * (size_t)(d * r), first, T + (size_t)at[i] * (size_t)(d * a));
-            first = 0;
+            if (at[col[k]] >= 0) {
+                w.blk[w.count] = K + (size_t)k * (size_t)dd;
+                w.phi[w.count] = phi + (size_t)at[col[k]] * (size_t)c;
+                w.vec[w.count++] = vec + (size_t)at[col[k]] * (size_t)(d * r);
+            }
+            if (w.count < TSS__SUB_ROW && k + 1 < row[i + 1]) continue;
+            tss__sub_row_times(d, c, r, &w, first, T + (size_t)at[i] * (size_t)(d * a));
+            first = 0, w.count = 0;
         }
     }
     if (t->used > 0) tss__sub_gather(d, t->used, a, T, c, r, phi, vec, 1, 0, H);
@@ -4024,7 +4059,9 @@ static void tss__sub_times_row(const tss__sub_project *p, int row, double *T) {
     const tss_subspace *s = p->s;
     const tss__modal *m = tss__sub_modal(s, p->col_body);
     const int d = s->dim, dd = d * d;
+    tss__sub_row w;
     int first = 1;
+    w.count = 0;
     for (int part = 0; part < 2; part++) {
         const tss_bcsr *K = part ? &s->C : &s->A;
         if (!(p->from & (1 << part)) || (!part && !tss__sub_u(&s->live_row)[row])) continue;
@@ -4034,12 +4071,14 @@ static void tss__sub_times_row(const tss__sub_project *p, int row, double *T) {
             const double *blk = K->val + k * dd;
             if (!tss__sub_nonzero(blk, dd)) continue;
             size_t at = (size_t)tss__sub_i(&s->live_index)[j];
-            tss__sub_row_times(d, m->c, m->r, blk, tss__sub_f(&m->phi) + at * (size_t)m->c,
-                               tss__sub_f(&m->vec) + at * (size_t)(d * m->r), first, T);
-            first = 0;
+            w.blk[w.count] = blk, w.phi[w.count] = tss__sub_f(&m->phi) + at * (size_t)m->c;
+            w.vec[w.count++] = tss__sub_f(&m->vec) + at * (size_t)(d * m->r);
+            if (w.count < TSS__SUB_ROW) continue;
+            tss__sub_row_times(d, m->c, m->r, &w, first, T);
+            first = 0, w.count = 0;
         }
     }
-    if (first) memset(T, 0, (size_t)(d * m->a) * sizeof(double));
+    if (first || w.count > 0) tss__sub_row_times(d, m->c, m->r, &w, first, T);
 }
 
 static void tss__sub_project_task(int lane, int worker, void *arg) {
@@ -4436,28 +4475,49 @@ static tss_result tss__sub_number_enriched(tss_subspace *s, const tss_unknowns *
     return TSS_OK;
 }
 
+typedef struct tss__sub_extraction {
+    const tss_subspace *s;
+    const tss_unknowns *u;
+    const tss_bcsr *K;
+    tss_bcsr *out;
+    int fill;
+} tss__sub_extraction;
+
+static void tss__sub_extract_task(int chunk, int worker, void *arg) {
+    const tss__sub_extraction *x = (const tss__sub_extraction *)arg;
+    const int *xrow = tss__sub_i(&x->s->xrow), *xnode = tss__sub_i(&x->s->xnode), dd = x->s->dim * x->s->dim;
+    int to = (chunk + 1) * 512 < x->s->xrows ? (chunk + 1) * 512 : x->s->xrows;
+    (void)worker;
+    for (int i = chunk * 512; i < to; i++) {
+        int r = x->u->row[xnode[i]];
+        int64_t at = x->fill ? x->out->row[i] : 0;
+        for (int64_t k = x->K->row[r]; k < x->K->row[r + 1]; k++) {
+            int c = xrow[x->K->col[k]];
+            if (c < 0) continue;
+            if (x->fill) {
+                x->out->col[at] = c;
+                memcpy(x->out->val + at * dd, x->K->val + k * dd, (size_t)dd * sizeof(double));
+            }
+            at++;
+        }
+        if (!x->fill) tss__sub_i(&x->s->row_list)[i] = (int)at;
+    }
+}
+
 // The rows and columns of K at enriched nodes.
 static tss_result tss__sub_extract(tss_subspace *s, const tss_unknowns *u, const tss_bcsr *K, uint64_t *from, tss_bcsr *out) {
+    tss__sub_extraction x = {s, u, K, out, 0};
+    int chunks = (s->xrows + 511) / 512;
     int64_t blocks = 0;
-    const int *xrow = tss__sub_i(&s->xrow), *xnode = tss__sub_i(&s->xnode), dd = s->dim * s->dim;
-    for (int i = 0; i < s->xrows; i++) {
-        int r = u->row[xnode[i]];
-        for (int64_t k = K->row[r]; k < K->row[r + 1]; k++) blocks += xrow[K->col[k]] >= 0;
-    }
+    if (!tss__sub_need(s, &s->row_list, (size_t)s->xrows, sizeof(int))) return tss__sub_no_memory(s);
+    tss_parallel(&s->host, chunks, tss__sub_extract_task, &x);
+    for (int i = 0; i < s->xrows; i++) blocks += tss__sub_i(&s->row_list)[i];
     uint64_t pattern = out->pattern, key = K->pattern * 1000003u + s->x_stamp;
     if (tss_bcsr_reserve(&s->host, out, s->xrows, s->dim, blocks) != TSS_OK) return tss__sub_no_memory(s);
-    int64_t at = 0;
-    for (int i = 0; i < s->xrows; i++) {
-        int r = u->row[xnode[i]];
-        out->row[i] = at;
-        for (int64_t k = K->row[r]; k < K->row[r + 1]; k++) {
-            int c = xrow[K->col[k]];
-            if (c < 0) continue;
-            out->col[at] = c;
-            memcpy(out->val + at++ * dd, K->val + k * dd, (size_t)dd * sizeof(double));
-        }
-    }
-    out->row[s->xrows] = at;
+    out->row[0] = 0;
+    for (int i = 0; i < s->xrows; i++) out->row[i + 1] = out->row[i] + tss__sub_i(&s->row_list)[i];
+    x.fill = 1;
+    tss_parallel(&s->host, chunks, tss__sub_extract_task, &x);
     out->pattern = *from == key ? pattern : ++s->xpattern;
     *from = key;
     return TSS_OK;
@@ -4542,6 +4602,23 @@ static void tss__sub_follow(const tss_subspace *s, const tss__sub_buf *ptr, cons
             for (int q = 0; q < d; q++) y[p] += sign * l[k].block[p * d + q] * x[l[k].other * d + q];
 }
 
+// y[p·n + k] += v[p] x[k], p < 3: x is read once.
+static void tss__sub_axpy3(int n, const double *v, const double *x, double *y) {
+    for (int k = 0; k < n; k++) y[k] += v[0] * x[k], y[n + k] += v[1] * x[k], y[2 * n + k] += v[2] * x[k];
+}
+
+// out[p] = Σ x[k] y[p·n + k], p < 3, each in four sums.
+static void tss__sub_dot3(int n, const double *x, const double *y, double *out) {
+    double sum[3][4] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
+    int i = 0;
+    for (; i + 4 <= n; i += 4)
+        for (int p = 0; p < 3; p++)
+            for (int t = 0; t < 4; t++) sum[p][t] += x[i + t] * y[p * n + i + t];
+    for (; i < n; i++)
+        for (int p = 0; p < 3; p++) sum[p][0] += x[i] * y[p * n + i];
+    for (int p = 0; p < 3; p++) out[p] = (sum[p][0] + sum[p][1]) + (sum[p][2] + sum[p][3]);
+}
+
 typedef struct tss__sub_jmul {
     tss_subspace *s;
     const double *in;
@@ -4562,9 +4639,10 @@ static void tss__sub_Jt_task(int lane, int worker, void *arg) {
         size_t at = (size_t)tss__sub_i(&s->live_index)[node];
         double v[3] = {0, 0, 0};
         tss__sub_follow(s, &s->border_ptr, &s->border_link, i, 1, m->in, v);
+        if (d == 3) tss__sub_axpy3(b->c, v, tss__sub_f(&b->phi) + at * (size_t)b->c, q + b->at);
         for (int p = 0; p < d; p++) {
-            tss__sub_axpy(b->c, v[p], tss__sub_f(&b->phi) + at * (size_t)b->c, q + b->at + p * b->c);
-            tss__sub_axpy(b->r, v[p], tss__sub_f(&b->vec) + (at * (size_t)d + (size_t)p) * (size_t)b->r, q + b->at + d * b->c);
+            if (d != 3) tss__sub_axpy(b->c, v[p], tss__sub_f(&b->phi) + at * (size_t)b->c, q + b->at + p * b->c);
+            if (b->r > 0) tss__sub_axpy(b->r, v[p], tss__sub_f(&b->vec) + (at * (size_t)d + (size_t)p) * (size_t)b->r, q + b->at + d * b->c);
         }
     }
 }
@@ -4602,10 +4680,12 @@ static void tss__sub_border_task(int chunk, int worker, void *arg) {
         int node = tss__sub_i(&s->border)[i];
         const tss__modal *b = tss__sub_modal(s, tss__sub_i(&s->body_of)[node]);
         size_t at = (size_t)tss__sub_i(&s->live_index)[node];
-        for (int p = 0; p < d; p++)
-            tss__sub_f(&s->border_u)[i * d + p] =
-                tss__sub_dot(b->c, tss__sub_f(&b->phi) + at * (size_t)b->c, m->in + b->at + p * b->c) +
-                tss__sub_dot(b->r, tss__sub_f(&b->vec) + (at * (size_t)d + (size_t)p) * (size_t)b->r, m->in + b->at + d * b->c);
+        double *out = tss__sub_f(&s->border_u) + i * d;
+        if (d == 3) tss__sub_dot3(b->c, tss__sub_f(&b->phi) + at * (size_t)b->c, m->in + b->at, out);
+        for (int p = 0; p < d; p++) {
+            if (d != 3) out[p] = tss__sub_dot(b->c, tss__sub_f(&b->phi) + at * (size_t)b->c, m->in + b->at + p * b->c);
+            out[p] += tss__sub_dot(b->r, tss__sub_f(&b->vec) + (at * (size_t)d + (size_t)p) * (size_t)b->r, m->in + b->at + d * b->c);
+        }
     }
 }
 
