@@ -1112,6 +1112,19 @@ void tss_parallel(const tss_host *host, int blocks, tss_task *task, void *arg) {
     for (int b = 0; b < blocks; b++) task(b, 0, arg);
 }
 
+// tss_parallel for blocks of equal work that pass after pass touch the same memory: a thread takes the
+// same blocks every time, so that they stay in its cache.
+static void tss__parallel_even(const tss_host *host, int blocks, tss_task *task, void *arg) {
+#ifdef TSS__OPENMP
+    if (!host->parallel_for && blocks > 1 && tss_workers(host) > 1) {
+#pragma omp parallel for schedule(static) num_threads(tss_workers(host))
+        for (int b = 0; b < blocks; b++) task(b, omp_get_thread_num(), arg);
+        return;
+    }
+#endif
+    tss_parallel(host, blocks, task, arg);
+}
+
 void tss_log(const tss_host *host, tss_log_level level, const char *format, ...) {
     if (!host->log) return;
     char line[1024];
@@ -4566,7 +4579,7 @@ void tss_bcsr_multiply(const tss_host *host, const tss_bcsr *A, const double *x,
     tss__spmv_job j;
     j.A = A, j.x = x, j.y = y, j.add = add;
     TSS_ASSERT(x != y || !A->n);
-    tss_parallel(host, tss__blocks(A->n, TSS__ROWS), tss__spmv_task, &j);
+    tss__parallel_even(host, tss__blocks(A->n, TSS__ROWS), tss__spmv_task, &j);
 }
 
 static void tss__diagonal_task(int block, int worker, void *arg) {
@@ -4804,7 +4817,7 @@ static void tss__pcg_start_task(int block, int worker, void *arg) {
 // Runs a pass and returns its sum number which, added in block order.
 static void tss__pcg_pass(tss_pcg *p, tss__pcg_job *j, tss_task *task, double out[2]) {
     int blocks = tss__blocks(j->n, TSS__ROWS);
-    tss_parallel(&p->host, blocks, task, j);
+    tss__parallel_even(&p->host, blocks, task, j);
     out[0] = out[1] = 0;
     for (int b = 0; b < blocks; b++) {
         out[0] += j->sums[(ptrdiff_t)b * TSS__SUMS];

@@ -4510,14 +4510,14 @@ static tss_result tss__sub_extract(tss_subspace *s, const tss_unknowns *u, const
     int chunks = (s->xrows + 511) / 512;
     int64_t blocks = 0;
     if (!tss__sub_need(s, &s->row_list, (size_t)s->xrows, sizeof(int))) return tss__sub_no_memory(s);
-    tss_parallel(&s->host, chunks, tss__sub_extract_task, &x);
+    tss__parallel_even(&s->host, chunks, tss__sub_extract_task, &x);
     for (int i = 0; i < s->xrows; i++) blocks += tss__sub_i(&s->row_list)[i];
     uint64_t pattern = out->pattern, key = K->pattern * 1000003u + s->x_stamp;
     if (tss_bcsr_reserve(&s->host, out, s->xrows, s->dim, blocks) != TSS_OK) return tss__sub_no_memory(s);
     out->row[0] = 0;
     for (int i = 0; i < s->xrows; i++) out->row[i + 1] = out->row[i] + tss__sub_i(&s->row_list)[i];
     x.fill = 1;
-    tss_parallel(&s->host, chunks, tss__sub_extract_task, &x);
+    tss__parallel_even(&s->host, chunks, tss__sub_extract_task, &x);
     out->pattern = *from == key ? pattern : ++s->xpattern;
     *from = key;
     return TSS_OK;
@@ -4654,7 +4654,7 @@ static tss_result tss__sub_Jt(tss_subspace *s, const double *x, double *q) {
     if (s->borders < 64)
         for (int l = 0; l < TSS__SUB_LANES; l++) tss__sub_Jt_task(l, 0, &m);
     else
-        tss_parallel(&s->host, TSS__SUB_LANES, tss__sub_Jt_task, &m);
+        tss__parallel_even(&s->host, TSS__SUB_LANES, tss__sub_Jt_task, &m);
     memset(q, 0, s->modes * sizeof(double));
     for (int l = 0; l < TSS__SUB_LANES; l++) tss__sub_axpy((int)s->modes, 1, m.out + (size_t)l * s->modes, q);
     return TSS_OK;
@@ -4705,8 +4705,8 @@ static void tss__sub_minus_J(tss_subspace *s, const double *q, double *x) {
     if (chunks < 4)
         for (int k = 0; k < chunks; k++) tss__sub_border_task(k, 0, &m);
     else
-        tss_parallel(&s->host, chunks, tss__sub_border_task, &m);
-    tss_parallel(&s->host, (s->xrows + 511) / 512, tss__sub_J_task, &m);
+        tss__parallel_even(&s->host, chunks, tss__sub_border_task, &m);
+    tss__parallel_even(&s->host, (s->xrows + 511) / 512, tss__sub_J_task, &m);
 }
 
 // y = (H_x − J H_q⁻¹ Jᵀ) x
