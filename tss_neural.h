@@ -157,6 +157,12 @@ TSS_API tss_result tss_net_jets(const tss_net *net, tss_work *work, int batch, i
 // zero with no stress at rest, linear elasticity with μ and λ for small strain, finite when
 // inverted. A polynomial in F: third derivatives are short. tss_neural_density gives a tss.h
 // material with it.
+// Shells (cloth): the same Ψ in two dimensions of triangles in space, F 3 × 2, J = √det FᵀF, vol =
+// area · thickness; and hinges (Grinspun et al. 2003, Discrete Shells)
+//     Σ k (θ − θ̄)² 3 ‖ē‖² / Ā,
+// θ the angle between the normals of two cells at an edge, θ̄ that of X, ē the edge and Ā the sum of
+// both areas at rest. θ is in (−π, π): a hinge must not fold through itself. Half of a hinge
+// belongs to either cell: with weights it counts ½ (w_1 + w_2), cells out of the subset with 0.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_elements_def {
@@ -164,8 +170,12 @@ typedef struct tss_elements_def {
     int nodes;
     const double *X;  // rest positions, nodes × dim, m
     int cells;
-    const int *cell;            // cells × (dim + 1), positive volume
-    double E, nu;               // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
+    const int *cell;  // cells × (dim + 1), positive volume (but see shell)
+    double E, nu;     // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
+    // Triangles in space: thickness, m, > 0, with dim 3 and cells × 3 nodes of positive area;
+    // default 0: none. J is then the ratio of areas and cannot be negative.
+    double shell;
+    double bending;  // k of a shell's hinges, J (N·m), >= 0; default 0. Edges of at most two cells
     const double *mu, *lambda;  // of each cell, Pa, in place of E and nu; both or NULL
     int count;                  // subset of cells (cubature, Eq. 11); used if subset is not NULL
     const int *subset;          // count cells, each at most once
@@ -1313,7 +1323,11 @@ struct tss_elements {
     double *Dinv, *vol, *mu, *la;  // cells × d², then w·vol, μ, λ'
     int *cell, *local;             // cells × (d+1): nodes; the same, numbered within dof
     int *dof;                      // used × d coordinates
-    int *hinge;                    // hinges × 4 nodes
+    double thick;                  // of a shell, m; 0: not one. Its Dinv are 2 × 2
+    double *rest, *hinge_weight;   // one block, hinges: θ̄; the shares of the two cells
+    int *hinge, *hinge_local;      // hinges × 4 nodes: an edge, the nodes across
+    int *cell_hinge;               // cells × 3: 2·hinge + which of its cells this is, −1: none
+    size_t hinge_bytes;
 };
 
 static void tss__mat_cross(const double A[9], const double B[9], double out[9]) {
@@ -1459,8 +1473,14 @@ static const char *tss__elements_complaint(const tss_elements_def *d, tss_result
     for (int i = 0; d->mu && i < d->cells; i++)
         if (!(d->mu[i] > 0 && d->mu[i] < 1e300 && d->lambda[i] > -d->mu[i] && d->lambda[i] < 1e300))
             return "elements: mu must be > 0 and lambda > −mu";
+    if (!(d->shell >= 0 && d->shell < 1e300 && d->bending >= 0 && d->bending < 1e300))
+        return "elements: shell or bending is negative or not finite";
+    *r = TSS_ERROR_BAD_ARGUMENT;
+    if (d->shell > 0 && d->dim != 3) return "elements: a shell is in space (dim 3)";
+    if (d->bending > 0 && !(d->shell > 0)) return "elements: bending needs a shell";
     *r = TSS_ERROR_BAD_MESH;
-    for (int i = 0; i < d->cells * (d->dim + 1); i++)
+    int per = d->shell > 0 ? 3 : d->dim + 1;
+    for (int i = 0; i < d->cells * per; i++)
         if (d->cell[i] < 0 || d->cell[i] >= d->nodes)
             return "elements: a cell names a node out of range";
     for (int i = 0; i < d->nodes * d->dim; i++)
@@ -1485,12 +1505,301 @@ static double tss__cell_rest(int d, const double *X, const int *v, double *Dinv)
     return det / (d == 3 ? 6 : 2);
 }
 
+// ---- shells ---------------------------------------------------------------------------------
+// Their gradients are written once, over hyper-dual numbers (Fike and Alonso 2011): v + a ε₁ + b ε₂
+// + ab ε₁ε₂ with ε₁² = ε₂² = 0. At x + ε₁A + ε₂B they give ∇, D_A∇, D_B∇ and D²_AB∇, exactly.
+
+typedef struct tss__hd {
+    double v, a, b, ab;
+} tss__hd;
+
+static tss__hd tss__hd_of(double v) {
+    tss__hd r = {v, 0, 0, 0};
+    return r;
+}
+static tss__hd tss__hd_add(tss__hd x, tss__hd y) {
+    tss__hd r = {x.v + y.v, x.a + y.a, x.b + y.b, x.ab + y.ab};
+    return r;
+}
+static tss__hd tss__hd_sub(tss__hd x, tss__hd y) {
+    tss__hd r = {x.v - y.v, x.a - y.a, x.b - y.b, x.ab - y.ab};
+    return r;
+}
+static tss__hd tss__hd_scale(double f, tss__hd x) {
+    tss__hd r = {f * x.v, f * x.a, f * x.b, f * x.ab};
+    return r;
+}
+static tss__hd tss__hd_mul(tss__hd x, tss__hd y) {
+    tss__hd r = {x.v * y.v, x.v * y.a + x.a * y.v, x.v * y.b + x.b * y.v,
+                 x.v * y.ab + x.a * y.b + x.b * y.a + x.ab * y.v};
+    return r;
+}
+// f(x) of a function with value f0 and derivatives f1, f2 at x.v.
+static tss__hd tss__hd_chain(tss__hd x, double f0, double f1, double f2) {
+    tss__hd r = {f0, f1 * x.a, f1 * x.b, f1 * x.ab + f2 * x.a * x.b};
+    return r;
+}
+static tss__hd tss__hd_inverse(tss__hd x) {
+    double i = 1 / x.v;
+    return tss__hd_chain(x, i, -i * i, 2 * i * i * i);
+}
+static tss__hd tss__hd_sqrt(tss__hd x) {
+    double s = sqrt(x.v);
+    return tss__hd_chain(x, s, 0.5 / s, -0.25 / (s * x.v));
+}
+static tss__hd tss__hd_dot(const tss__hd *x, const tss__hd *y) {
+    return tss__hd_add(tss__hd_add(tss__hd_mul(x[0], y[0]), tss__hd_mul(x[1], y[1])),
+                       tss__hd_mul(x[2], y[2]));
+}
+static void tss__hd_cross(const tss__hd *x, const tss__hd *y, tss__hd *out) {
+    for (int i = 0; i < 3; i++) {
+        int j = (i + 1) % 3, k = (i + 2) % 3;
+        out[i] = tss__hd_sub(tss__hd_mul(x[j], y[k]), tss__hd_mul(x[k], y[j]));
+    }
+}
+// The angle of (x, y): that at the base, and the arc tangent (whose second derivative is 0 there)
+// of what is left of it.
+static tss__hd tss__hd_atan2(tss__hd y, tss__hd x) {
+    double l = sqrt(x.v * x.v + y.v * y.v), c = x.v / l, s = y.v / l;
+    tss__hd up = tss__hd_sub(tss__hd_scale(c, y), tss__hd_scale(s, x));
+    tss__hd along = tss__hd_add(tss__hd_scale(c, x), tss__hd_scale(s, y));
+    tss__hd t = tss__hd_mul(up, tss__hd_inverse(along));
+    t.v = atan2(y.v, x.v);
+    return t;
+}
+
+// A triangle: vol Ψ(F) of three nodes, F 3 × 2. With δ = FᵀF − I, n = F_0 × F_1 and J = |n|, as in
+// the plane,
+//     Ψ = μ/2 (j² − det δ) + λ'/2 j²,   j = J − 1 = (tr + det)(δ) / (1 + J),
+//     Ψ' = μ F + (λ' j − μ) J',   J' = (F_1 × n, n × F_0) / J.
+// J' is taken as 0 where a triangle has no area. Its gradient goes to g.
+static double tss__shell_cell(const double *Dinv, double vol, double mu, double la,
+                              const tss__hd *x, tss__hd *g) {
+    tss__hd F[2][3], n[3], D[2][3], one = tss__hd_of(1);
+    for (int r = 0; r < 3; r++) {
+        tss__hd e = tss__hd_sub(x[3 + r], x[r]), f = tss__hd_sub(x[6 + r], x[r]);
+        for (int m = 0; m < 2; m++)
+            F[m][r] = tss__hd_add(tss__hd_scale(Dinv[m], e), tss__hd_scale(Dinv[2 + m], f));
+    }
+    tss__hd xx = tss__hd_sub(tss__hd_dot(F[0], F[0]), one), xy = tss__hd_dot(F[0], F[1]);
+    tss__hd yy = tss__hd_sub(tss__hd_dot(F[1], F[1]), one);
+    tss__hd det = tss__hd_sub(tss__hd_mul(xx, yy), tss__hd_mul(xy, xy));
+    tss__hd more = tss__hd_add(tss__hd_add(xx, yy), det), J = tss__hd_of(0), inverse = J;
+    tss__hd_cross(F[0], F[1], n);
+    tss__hd square = tss__hd_dot(n, n);
+    if (square.v > 1e-24) J = tss__hd_sqrt(square), inverse = tss__hd_inverse(J);
+    tss__hd j = tss__hd_mul(more, tss__hd_inverse(tss__hd_add(one, J)));
+    tss__hd s = tss__hd_mul(tss__hd_sub(tss__hd_scale(la, j), tss__hd_of(mu)), inverse);
+    tss__hd_cross(F[1], n, D[0]), tss__hd_cross(n, F[0], D[1]);
+    for (int r = 0; r < 3; r++) {
+        tss__hd P[2];
+        for (int m = 0; m < 2; m++)
+            P[m] = tss__hd_add(tss__hd_scale(mu, F[m][r]), tss__hd_mul(s, D[m][r]));
+        for (int i = 0; i < 2; i++)
+            g[3 * (i + 1) + r] =
+                tss__hd_scale(vol, tss__hd_add(tss__hd_scale(Dinv[2 * i], P[0]),
+                                               tss__hd_scale(Dinv[2 * i + 1], P[1])));
+        g[r] = tss__hd_scale(-1, tss__hd_add(g[3 + r], g[6 + r]));
+    }
+    return 0.5 * vol * (mu * (j.v * j.v - det.v) + la * j.v * j.v);
+}
+
+// A hinge: w (θ − rest)² of nodes 0, 1 (its edge) and 2, 3 (across), θ the angle between the
+// normals, 0 when flat; ∂θ as in Bridson, Marino and Fedkiw 2003. *angle (NULL: not wanted): θ.
+// Beside a triangle without area it is 0.
+static double tss__shell_hinge(double w, double rest, const tss__hd *x, tss__hd *g, double *angle) {
+    tss__hd e[3], a[4][3], N[2][3], across[3];  // a: nodes 2 and 3 seen from 0, then from 1
+    for (int i = 0; i < 12; i++) g[i] = tss__hd_of(0);
+    for (int r = 0; r < 3; r++) {
+        e[r] = tss__hd_sub(x[3 + r], x[r]);
+        for (int k = 0; k < 4; k++)
+            a[k][r] = tss__hd_sub(x[6 + 3 * (k & 1) + r], x[3 * (k >> 1) + r]);
+    }
+    tss__hd_cross(a[0], a[2], N[0]), tss__hd_cross(a[3], a[1], N[1]);
+    tss__hd E = tss__hd_dot(e, e), n[2] = {tss__hd_dot(N[0], N[0]), tss__hd_dot(N[1], N[1])};
+    if (angle) *angle = 0;
+    if (!(E.v > 0 && n[0].v > 0 && n[1].v > 0)) return 0;
+    tss__hd l = tss__hd_sqrt(E), unit = tss__hd_inverse(l);
+    tss__hd_cross(N[1], N[0], across);
+    tss__hd theta =
+        tss__hd_atan2(tss__hd_mul(tss__hd_dot(across, e), unit), tss__hd_dot(N[0], N[1]));
+    if (angle) *angle = theta.v;
+    tss__hd gap = tss__hd_sub(theta, tss__hd_of(rest)), f = tss__hd_scale(2 * w, gap);
+    for (int k = 0; k < 2; k++) {  // shares of the two normals
+        tss__hd q = tss__hd_mul(f, tss__hd_inverse(n[k])), from_e = tss__hd_mul(q, unit);
+        tss__hd far = tss__hd_mul(q, l);
+        tss__hd from0 = tss__hd_mul(tss__hd_dot(a[2 + k], e), from_e);
+        tss__hd from1 = tss__hd_mul(tss__hd_dot(a[k], e), from_e);
+        for (int r = 0; r < 3; r++) {
+            g[6 + 3 * k + r] = tss__hd_mul(far, N[k][r]);
+            g[r] = tss__hd_add(g[r], tss__hd_mul(from0, N[k][r]));
+            g[3 + r] = tss__hd_sub(g[3 + r], tss__hd_mul(from1, N[k][r]));
+        }
+    }
+    return w * gap.v * gap.v;
+}
+
+// Stencil k: a cell, or the hinge k − cells. Columns of 3·nodes numbers: x, A and B (NULL: 0).
+static double tss__shell_stencil(const tss_elements *e, int k, const double *x, const double *A,
+                                 const double *B, tss__hd *g) {
+    tss__hd p[12];
+    int hinge = k - e->cells;
+    for (int i = 0; i < (hinge < 0 ? 9 : 12); i++) {
+        p[i] = tss__hd_of(x[i]);
+        if (A) p[i].a = A[i];
+        if (B) p[i].b = B[i];
+    }
+    if (hinge < 0) return tss__shell_cell(e->Dinv + 4 * k, e->vol[k], e->mu[k], e->la[k], p, g);
+    return tss__shell_hinge(e->hinge_weight[2 * hinge] + e->hinge_weight[2 * hinge + 1],
+                            e->rest[hinge], p, g, NULL);
+}
+
+static const int *tss__shell_nodes(const tss_elements *e, const int *cell, const int *hinge, int k,
+                                   int *count) {
+    *count = k < e->cells ? 3 : 4;
+    return k < e->cells ? cell + 3 * k : hinge + 4 * (k - e->cells);
+}
+
+static void tss__shell_gather(const double *x, const int *v, int count, double *to) {
+    for (int i = 0; i < count; i++)
+        for (int r = 0; r < 3; r++) to[3 * i + r] = x[3 * v[i] + r];
+}
+
+static double tss__shell_run(const tss_elements *e, const int *cell, const int *hinge,
+                             const double *x, double *g) {
+    double P = 0;
+    for (int k = 0; k < e->cells + e->hinges; k++) {
+        double at[12];
+        tss__hd G[12];
+        int count;
+        const int *v = tss__shell_nodes(e, cell, hinge, k, &count);
+        tss__shell_gather(x, v, count, at);
+        P += tss__shell_stencil(e, k, at, NULL, NULL, G);
+        for (int i = 0; g && i < 3 * count; i++) g[3 * v[i / 3] + i % 3] += G[i].v;
+    }
+    return P;
+}
+
+// ---- hinges of a shell ----------------------------------------------------------------------
+
+typedef struct tss__n_edge {
+    int lo, hi, cell, across;
+} tss__n_edge;
+
+static int tss__edge_order(const void *a, const void *b) {
+    const tss__n_edge *p = (const tss__n_edge *)a, *q = (const tss__n_edge *)b;
+    if (p->lo != q->lo) return p->lo < q->lo ? -1 : 1;
+    if (p->hi != q->hi) return p->hi < q->hi ? -1 : 1;
+    return p->cell < q->cell ? -1 : p->cell > q->cell;
+}
+
+// D⁻¹ (2 × 2) of a triangle in axes of its own, the first along its first edge; returns its area.
+static double tss__shell_rest(const double *X, const int *v, double *Dinv) {
+    double e[3], f[3], ef = 0, l = 0, area = 0;
+    for (int r = 0; r < 3; r++) {
+        e[r] = X[v[1] * 3 + r] - X[v[0] * 3 + r], f[r] = X[v[2] * 3 + r] - X[v[0] * 3 + r];
+        l += e[r] * e[r], ef += e[r] * f[r];
+    }
+    for (int r = 0; r < 3; r++) {
+        double n = e[(r + 1) % 3] * f[(r + 2) % 3] - e[(r + 2) % 3] * f[(r + 1) % 3];
+        area += n * n;
+    }
+    l = sqrt(l), area = sqrt(area);
+    // D = [l, ef/l; 0, area/l].
+    Dinv[0] = 1 / l, Dinv[1] = -ef / (l * area), Dinv[2] = 0, Dinv[3] = l / area;
+    return 0.5 * area;
+}
+
+// Sorts the edges of all cells. −1: an edge has more than two cells; else the hinges whose two
+// cells are not both out of the subset (place < 0).
+static int tss__shell_edges(const tss_elements_def *d, const int *place, tss__n_edge *edge) {
+    int count = 0, all = 3 * d->cells;
+    for (int k = 0; k < all; k++) {
+        const int *v = d->cell + k / 3 * 3;
+        int a = v[k % 3], b = v[(k + 1) % 3];
+        tss__n_edge e = {a < b ? a : b, a < b ? b : a, k / 3, v[(k + 2) % 3]};
+        edge[k] = e;
+    }
+    qsort(edge, (size_t)all, sizeof *edge, tss__edge_order);
+    for (int k = 0; k + 1 < all; k++) {
+        if (edge[k].lo != edge[k + 1].lo || edge[k].hi != edge[k + 1].hi) continue;
+        if (k + 2 < all && edge[k].lo == edge[k + 2].lo && edge[k].hi == edge[k + 2].hi) return -1;
+        count += place[edge[k].cell] >= 0 || place[edge[k + 1].cell] >= 0;
+    }
+    return count;
+}
+
+static void tss__shell_fill(tss_elements *e, const tss_elements_def *d, const int *place,
+                            const tss__n_edge *edge) {
+    int at = 0;
+    for (int i = 0; i < 3 * e->cells; i++) e->cell_hinge[i] = -1;
+    for (int k = 0; k + 1 < 3 * d->cells; k++) {
+        if (edge[k].lo != edge[k + 1].lo || edge[k].hi != edge[k + 1].hi) continue;
+        const tss__n_edge pair[2] = {edge[k], edge[k + 1]};
+        if (place[pair[0].cell] < 0 && place[pair[1].cell] < 0) continue;
+        int *v = e->hinge + 4 * at;
+        double x[12], Dinv[4], area = 0, l = 0;
+        tss__hd p[12], g[12];
+        v[0] = pair[0].lo, v[1] = pair[0].hi, v[2] = pair[0].across, v[3] = pair[1].across;
+        tss__shell_gather(d->X, v, 4, x);
+        for (int i = 0; i < 12; i++) p[i] = tss__hd_of(x[i]);
+        tss__shell_hinge(0, 0, p, g, &e->rest[at]);
+        for (int r = 0; r < 3; r++) l += (x[3 + r] - x[r]) * (x[3 + r] - x[r]);
+        for (int c = 0; c < 2; c++) area += tss__shell_rest(d->X, d->cell + 3 * pair[c].cell, Dinv);
+        for (int c = 0; c < 2; c++) {
+            int in = place[pair[c].cell], slot = 0;
+            double w = in < 0 ? 0 : d->weight ? d->weight[in] : 1;
+            e->hinge_weight[2 * at + c] = 0.5 * w * d->bending * 3 * l / area;
+            if (in < 0) continue;
+            while (e->cell_hinge[3 * in + slot] >= 0) slot++;
+            e->cell_hinge[3 * in + slot] = 2 * at + c;
+        }
+        at++;
+    }
+}
+
+static tss_result tss__shell_hinges(tss_elements *e, const tss_elements_def *d,
+                                    const char **wrong) {
+    size_t cells = (size_t)d->cells, bytes = cells * (3 * sizeof(tss__n_edge) + sizeof(int));
+    tss__n_edge *edge = (tss__n_edge *)tss_alloc(&e->host, bytes);
+    if (!edge) return TSS_ERROR_NO_MEMORY;
+    int *place = (int *)(void *)(edge + 3 * cells);
+    for (int k = 0; k < d->cells; k++) place[k] = d->subset ? -1 : k;
+    for (int k = 0; d->subset && k < d->count; k++) place[d->subset[k]] = k;
+    tss_result r = TSS_OK;
+    double Dinv[4];
+    for (int k = 0; k < d->cells; k++)
+        if (!(tss__shell_rest(d->X, d->cell + 3 * k, Dinv) > 0)) r = TSS_ERROR_BAD_MESH;
+    int count = tss__shell_edges(d, place, edge);
+    size_t h = (size_t)(count > 0 ? count : 0), m = 3 * (size_t)e->cells;
+    if (count < 0 && r == TSS_OK)
+        r = TSS_ERROR_BAD_MESH, *wrong = "elements: more than two triangles share an edge";
+    if (r == TSS_OK && count > 0) {
+        e->hinge_bytes = 3 * h * sizeof(double) + (8 * h + m) * sizeof(int);
+        e->rest = (double *)tss_alloc(&e->host, e->hinge_bytes);
+        if (!e->rest) r = TSS_ERROR_NO_MEMORY;
+    }
+    if (r == TSS_OK && count > 0) {
+        e->hinges = count, e->hinge_weight = e->rest + h;
+        e->hinge = (int *)(void *)(e->hinge_weight + 2 * h), e->hinge_local = e->hinge + 4 * h;
+        e->cell_hinge = e->hinge_local + 4 * h;
+        tss__shell_fill(e, d, place, edge);
+    }
+    tss_free(&e->host, edge, bytes);
+    return r;
+}
+
 static tss_result tss__elements_fill(tss_elements *e, const tss_elements_def *d, int *number) {
-    int dim = e->dim, v = dim + 1;
+    int dim = e->dim, v = e->per;
     for (int i = 0; i < d->nodes; i++) number[i] = -1;
+    for (int i = 0; i < 4 * e->hinges; i++) number[e->hinge[i]] = 0;
     for (int k = 0; k < e->cells; k++) {
         int at = d->subset ? d->subset[k] : k;
-        double mu, la, vol = tss__cell_rest(dim, d->X, d->cell + at * v, e->Dinv + k * dim * dim);
+        double mu, la, vol;
+        if (e->thick > 0)
+            vol = e->thick * tss__shell_rest(d->X, d->cell + at * v, e->Dinv + k * 4);
+        else
+            vol = tss__cell_rest(dim, d->X, d->cell + at * v, e->Dinv + k * dim * dim);
         if (!(vol > 0 && vol < 1e300)) return TSS_ERROR_BAD_MESH;
         tss_lame(d->E, d->nu, &mu, &la);
         if (d->mu) mu = d->mu[at], la = d->lambda[at];
@@ -1503,6 +1812,7 @@ static tss_result tss__elements_fill(tss_elements *e, const tss_elements_def *d,
         number[i] = e->used++;
     }
     for (int i = 0; i < e->cells * v; i++) e->local[i] = number[e->cell[i]];
+    for (int i = 0; i < 4 * e->hinges; i++) e->hinge_local[i] = number[e->hinge[i]];
     return TSS_OK;
 }
 
@@ -1510,6 +1820,7 @@ void tss_elements_destroy(tss_elements *e) {
     if (!e) return;
     tss_host h = e->host;
     tss_free(&h, e->p, e->bytes);
+    tss_free(&h, e->rest, e->hinge_bytes);
     tss_free(&h, e, sizeof *e);
 }
 
@@ -1517,10 +1828,11 @@ static tss_elements *tss__elements_alloc(const tss_host *h, const tss_elements_d
     tss_elements *e = (tss_elements *)tss_alloc(h, sizeof *e);
     if (!e) return NULL;
     memset(e, 0, sizeof *e);
-    e->host = *h, e->dim = d->dim, e->per = d->dim + 1, e->nodes = d->nodes,
-    e->cells = d->subset ? d->count : d->cells;
+    e->host = *h, e->dim = d->dim, e->per = d->shell > 0 ? 3 : d->dim + 1, e->thick = d->shell,
+    e->nodes = d->nodes, e->cells = d->subset ? d->count : d->cells;
     size_t m = (size_t)e->cells, dim = (size_t)d->dim, most = (size_t)d->nodes;
-    if (m * (dim + 1) < most) most = m * (dim + 1);  // nodes that can be used
+    if (m * (dim + 1) < most && !(d->shell > 0))  // nodes that can be used
+        most = m * (dim + 1);
     e->bytes =
         m * (dim * dim + 3) * sizeof(double) + (2 * m * (dim + 1) + most * dim) * sizeof(int);
     e->p = tss_alloc(h, e->bytes);
@@ -1550,11 +1862,13 @@ tss_result tss_elements_create(const tss_host *host, const tss_elements_def *d,
         tss_elements_destroy(e);
         return TSS_ERROR_NO_MEMORY;
     }
-    r = tss__elements_fill(e, d, number);
+    wrong = "elements: a cell is flat or inverted";
+    r = d->shell > 0 && d->bending > 0 ? tss__shell_hinges(e, d, &wrong) : TSS_OK;
+    if (r == TSS_OK) r = tss__elements_fill(e, d, number);
     tss_free(&h, number, bytes);
     if (r != TSS_OK) {
         tss_elements_destroy(e);
-        return tss__n_refuse(&h, r, "elements: a cell is flat or inverted");
+        return r == TSS_ERROR_BAD_MESH ? tss__n_refuse(&h, r, wrong) : r;
     }
     *out = e;
     return TSS_OK;
@@ -1657,11 +1971,71 @@ static void tss__jet_tangent(const tss__n_jet *t, const tss__n_cell *q, const do
     }
 }
 
+// x̂_a = Σ_b C_ab x_b, and Σ β_a x_a + γ x_2.
+static void tss__shell_mix(const tss__n_jet *t, const double *x, double *hat, double *mix) {
+    tss__n_zero(mix, 12), tss__n_zero(hat, 12 * (size_t)t->k);
+    for (int a = 0; a < t->k; a++)
+        for (int i = 0; i < 12; i++) {
+            mix[i] += t->beta ? t->beta[a] * x[12 * (a + 1) + i] : 0;
+            for (int b = 0; t->second && b < t->k; b++)
+                hat[12 * a + i] += t->C[a * t->k + b] * x[12 * (b + 1) + i];
+        }
+    for (int i = 0; t->second && i < 12; i++) mix[i] += t->gamma * x[12 * (t->k + 1) + i];
+}
+
+// What tss__jet_run does, of one stencil; m numbers a column.
+static void tss__shell_jet(tss__n_jet *t, int s, int m, const double *x, double *hat, double *bar) {
+    tss__hd g[12];
+    double mix[12];
+    int k = t->k, tangent = t->mode == TSS__CELL_TANGENT;
+    tss__shell_mix(t, x, hat, mix);
+    t->P += tss__shell_stencil(t->e, s, x, mix, NULL, g);
+    for (int i = 0; i < m; i++) {
+        for (int a = 0; a < k; a++) {
+            if (t->P1) t->P1[a] += g[i].v * x[12 * (a + 1) + i];
+            bar[12 * (a + 1) + i] = t->beta ? t->beta[a] * g[i].v : 0;
+        }
+        if (t->second)
+            t->P2 += g[i].v * x[12 * (k + 1) + i], bar[12 * (k + 1) + i] = t->gamma * g[i].v;
+        bar[i] = tangent ? g[i].v : t->alpha * g[i].v + g[i].a;
+    }
+    for (int a = 0; a < k && (t->second || tangent); a++) {
+        tss__shell_stencil(t->e, s, x, x + 12 * (a + 1), t->second ? hat + 12 * a : NULL, g);
+        for (int i = 0; i < m; i++) {
+            if (tangent) {
+                bar[12 * (a + 1) + i] = g[i].a;
+                continue;
+            }
+            t->P2 += g[i].a * hat[12 * a + i];
+            bar[12 * (a + 1) + i] += 2 * t->gamma * g[i].b;
+            bar[i] += t->gamma * g[i].ab;
+        }
+    }
+}
+
+static void tss__shell_jets(tss__n_jet *t) {
+    int cols = 1 + t->k + t->second, count;
+    double *x = t->scratch, *hat = x + 12 * cols, *bar = hat + 12 * (t->k + 1);
+    for (int s = 0; s < t->e->cells + t->e->hinges; s++) {
+        const int *v = tss__shell_nodes(t->e, t->cell, t->hinge, s, &count);
+        for (int c = 0; c < cols; c++)
+            tss__shell_gather(t->x + (size_t)c * t->ld, v, count, x + 12 * c);
+        tss__shell_jet(t, s, 3 * count, x, hat, bar);
+        for (int c = 0; t->mode != TSS__CELL_VALUE && c < cols; c++)
+            for (int i = 0; i < 3 * count; i++)
+                t->bar[(size_t)c * t->ld + (size_t)(3 * v[i / 3] + i % 3)] += bar[12 * c + i];
+    }
+}
+
 static void tss__jet_run(tss__n_jet *t) {
     int cols = 1 + t->k + t->second, d = t->e->dim;
     double *F = t->scratch, *hat = F + 9 * cols, *bar = hat + 9 * (t->k + 1);
     t->P = t->P2 = 0;
     if (t->P1) tss__n_zero(t->P1, (size_t)t->k);
+    if (t->e->thick > 0) {
+        tss__shell_jets(t);
+        return;
+    }
     for (int k = 0; k < t->e->cells; k++) {
         tss__n_cell q;
         double vol = t->e->vol[k];
@@ -1795,8 +2169,7 @@ static double tss__lanes_run(const tss_elements *e, const int *cell, const doubl
 // P at x; its gradient is added to g (NULL: not wanted). Nodes are numbered as in cell and hinge.
 static double tss__elements_gradient(const tss_elements *e, const int *cell, const int *hinge,
                                      const double *x, double *g) {
-    (void)hinge;
-    return tss__lanes_run(e, cell, x, g);
+    return e->thick > 0 ? tss__shell_run(e, cell, hinge, x, g) : tss__lanes_run(e, cell, x, g);
 }
 
 double tss_elements_potential(const tss_elements *e, const double *x, double *g) {
@@ -1815,8 +2188,8 @@ tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, cons
     tss__n_zero(p, count);
     tss__n_jet t;
     memset(&t, 0, sizeof t);
-    t.e = e, t.cell = e->cell, t.mode = TSS__CELL_REVERSE, t.k = k, t.second = C != NULL, t.x = p,
-    t.ld = n;
+    t.e = e, t.cell = e->cell, t.hinge = e->hinge, t.mode = TSS__CELL_REVERSE, t.k = k,
+    t.second = C != NULL, t.x = p, t.ld = n;
     t.C = C, t.alpha = alpha, t.beta = beta, t.gamma = gamma, t.bar = p + cols * n, t.P1 = P1;
     t.scratch = t.bar + cols * n;
     memcpy(p, x, wide);
@@ -1884,6 +2257,7 @@ static void tss__reduced_elements(tss__n_reduced *j, int c) {
         tss__n_jet t;
         memset(&t, 0, sizeof t);
         t.e = j->e, t.cell = p->dof ? j->e->local : j->e->cell, t.mode = j->mode, t.k = p->k;
+        t.hinge = p->dof ? j->e->hinge_local : j->e->hinge;
         t.second = p->second, t.x = p->x + row, t.ld = p->coords;
         t.C = p->second ? p->C + (size_t)i * (size_t)(p->k * p->k) : NULL;
         t.alpha = j->alpha ? j->alpha[i] : j->all_alpha, t.beta = j->betas, t.gamma = j->gamma;
@@ -2490,6 +2864,29 @@ typedef struct tss__cub_fill {  // one sample's rows of G
     double scale;
 } tss__cub_fill;
 
+// The reduced gradient of a shell's cell: its own, and half of its hinges'.
+static void tss__cub_fill_shell(const tss__cub_fill *f, int cell, double *to) {
+    const tss_elements *e = f->e;
+    for (int s = -1; s < (e->hinges ? 3 : 0); s++) {
+        int share = s < 0 ? -1 : e->cell_hinge[3 * cell + s], count;
+        if (s >= 0 && share < 0) continue;
+        double x[12];
+        tss__hd p[12], g[12];
+        const int *v =
+            tss__shell_nodes(e, e->cell, e->hinge, s < 0 ? cell : e->cells + share / 2, &count);
+        tss__shell_gather(f->x, v, count, x);
+        for (int i = 0; i < 3 * count; i++) p[i] = tss__hd_of(x[i]);
+        if (s < 0)
+            tss__shell_cell(e->Dinv + 4 * cell, e->vol[cell], e->mu[cell], e->la[cell], p, g);
+        else
+            tss__shell_hinge(e->hinge_weight[share], e->rest[share / 2], p, g, NULL);
+        for (int a = 0; a < f->r; a++) {
+            tss__shell_gather(f->x + (size_t)(a + 1) * f->n, v, count, x);
+            for (int i = 0; i < 3 * count; i++) to[a] += f->scale * g[i].v * x[i];
+        }
+    }
+}
+
 static void tss__cub_fill_task(int block, int worker, void *arg) {
     (void)worker;
     tss__cub_fill *f = (tss__cub_fill *)arg;
@@ -2502,6 +2899,11 @@ static void tss__cub_fill_task(int block, int worker, void *arg) {
         tss__n_jet t;
         memset(&t, 0, sizeof t);
         int cell = c->cell[k];
+        if (e->thick > 0) {
+            double *to = c->G + (size_t)k * c->m + f->first;
+            tss__n_zero(to, (size_t)f->r), tss__cub_fill_shell(f, cell, to);
+            continue;
+        }
         t.e = e, t.cell = e->cell, t.x = f->x, t.ld = f->n;
         tss__jet_gather(&t, cell, 1, F);
         tss__cell_at(&q, e->dim, e->mu[cell], e->la[cell], F);
