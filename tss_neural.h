@@ -510,6 +510,35 @@ typedef struct tss_halfspace {  // φ = normal·(x − point): what lies against
 TSS_API double tss_sdf_ball(void *ball, const double *x, double *n);
 TSS_API double tss_sdf_halfspace(void *halfspace, const double *x, double *n);
 
+// ---------------------------------------------------------------------------------------------
+// >>decoder_basis (public)
+// A decoder as a basis of the adaptive simulator (tss_subspace.h, tss_basis_custom): its tangent
+// ∂f/∂z at the z whose f(z) is nearest to the body, anew in every step,
+//     tss_decoder_basis *b;
+//     tss_decoder_basis_create(NULL, 3, decoder, NULL, mass, NULL, &b);
+//     tss_basis_def d = tss_basis_custom(r, NULL, tss_decoder_basis_refresh, b);
+//     tss_basis_add(world, body, &d, NULL);
+// which the oracle then enriches with nodes where it does not suffice.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_decoder_basis tss_decoder_basis;  // opaque; one body, as long as its world
+// The decoder (no in_matrix, r <= 1024 inputs) gives the coordinates of all nodes of the body in
+// its order; both nets are borrowed and must not change. encoder (NULL allowed): z is looked for
+// from g(x), and depends on x alone; without one from the last z, so that a run that is resumed
+// must put it back with tss_decoder_basis_set. mass: of each coordinate, copied; NULL: 1. z: where
+// it starts, NULL: 0. Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+TSS_API tss_result tss_decoder_basis_create(const tss_host *host, int dim, const tss_net *decoder,
+                                            const tss_net *encoder, const double *mass,
+                                            const double *z, tss_decoder_basis **out);
+TSS_API void tss_decoder_basis_destroy(tss_decoder_basis *b);  // NULL allowed
+// For tss_basis_custom, with b as user. Column a is the part of ∂f/∂z_a that is orthogonal in M to
+// those before it, of unit norm: the same span, well conditioned (0 where there is no such part).
+// A body of another number of nodes: columns of 0, and an error in the log. Allocates nothing.
+TSS_API void tss_decoder_basis_refresh(void *b, const tss_ctx *c, int first_node, int nodes,
+                                       double *columns);
+TSS_API const double *tss_decoder_basis_z(const tss_decoder_basis *b);  // r, of the last refresh
+TSS_API tss_result tss_decoder_basis_set(tss_decoder_basis *b, const double *z);  // or BAD_STATE
+
 #ifdef __cplusplus
 }
 #endif
@@ -4438,6 +4467,114 @@ double tss_sdf_halfspace(void *halfspace, const double *x, double *n) {
     double s = 0;
     for (int a = 0; a < h->dim; a++) n[a] = h->normal[a], s += n[a] * (x[a] - h->point[a]);
     return s;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>decoder_basis (private)
+// A reduced solver without elements finds z; with f = c + Bφ the Gram matrix of the tangent is
+// ∂φᵀ G ∂φ: columns are made orthonormal in the r rows of ∂φ, before B.
+// ---------------------------------------------------------------------------------------------
+
+struct tss_decoder_basis {
+    tss_host host;
+    tss_reduced *s;
+    const tss_net *encoder;
+    tss_work *work;
+    double *z;  // r: g(x)
+};
+
+void tss_decoder_basis_destroy(tss_decoder_basis *b) {
+    if (!b) return;
+    tss_host h = b->host;
+    if (b->s) tss_free(&h, b->z, (size_t)b->s->r * sizeof(double));
+    tss_reduced_destroy(b->s);
+    tss_work_destroy(b->work);
+    tss_free(&h, b, sizeof *b);
+}
+
+tss_result tss_decoder_basis_create(const tss_host *host, int dim, const tss_net *decoder,
+                                    const tss_net *encoder, const double *mass, const double *z,
+                                    tss_decoder_basis **out) {
+    tss_host h = host ? *host : tss_host_default();
+    tss_reduced_def d = tss_reduced_def_default();
+    const char *wrong = NULL;
+    *out = NULL;
+    d.decoder = decoder, d.mass = mass, d.start = z, d.h = 0;
+    if ((dim != 2 && dim != 3) || !decoder || decoder->has_in || decoder->outputs % dim)
+        wrong = "decoder basis: the decoder does not give positions of nodes";
+    else if (decoder->inputs > TSS__REDUCED_DENSE)
+        wrong = "decoder basis: more than 1024 inputs";
+    else if (encoder &&
+             (encoder->inputs != decoder->outputs || encoder->outputs != decoder->inputs))
+        wrong = "decoder basis: decoder and encoder do not fit each other";
+    else
+        wrong = tss__reduced_complaint(&d);
+    if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss_decoder_basis *b = (tss_decoder_basis *)tss_alloc(&h, sizeof *b);
+    if (!b) return TSS_ERROR_NO_MEMORY;
+    memset(b, 0, sizeof *b);
+    b->host = h, b->encoder = encoder;
+    tss_result r = tss__reduced_make(&h, &d, dim, &b->s);
+    if (r == TSS_OK) {
+        b->z = (double *)tss_alloc(&h, (size_t)b->s->r * sizeof(double));
+        r = b->z ? tss_work_create(&h, &b->work) : TSS_ERROR_NO_MEMORY;
+    }
+    // The encoder's scratch is taken now.
+    if (r == TSS_OK && encoder) r = tss_net_forward(encoder, b->work, 1, tss_reduced_x(b->s), b->z);
+    if (r != TSS_OK) {
+        tss_decoder_basis_destroy(b);
+        return r;
+    }
+    *out = b;
+    return TSS_OK;
+}
+
+static double tss__basis_product(tss_reduced *s, const double *u, const double *v) {  // uᵀ G v
+    for (size_t i = 0; i < s->m; i++) s->gap[i] = tss__n_dot8(s->m, s->G + i * s->m, v);
+    return tss__n_dot8(s->m, u, s->gap);
+}
+
+// The tangent's rows (derivatives of φ) made orthonormal in G, in their order, by Gram and Schmidt
+// twice; what depends on those before to 0.
+static void tss__basis_orthonormal(tss_reduced *s, double *rows) {
+    size_t m = s->m;
+    for (size_t a = 0; a < (size_t)s->r; a++) {
+        double *v = rows + a * m, before = tss__basis_product(s, v, v);
+        for (size_t b = 0; b < 2 * a; b++) {
+            const double *u = rows + b % a * m;
+            tss__n_axpy(m, -tss__basis_product(s, u, v), u, v);
+        }
+        double after = tss__basis_product(s, v, v),
+               unit = after > 1e-20 * before ? 1 / sqrt(after) : 0;
+        for (size_t i = 0; i < m; i++) v[i] *= unit;
+    }
+}
+
+void tss_decoder_basis_refresh(void *user, const tss_ctx *c, int first_node, int nodes,
+                               double *columns) {
+    tss_decoder_basis *b = (tss_decoder_basis *)user;
+    tss_reduced *s = b->s;
+    size_t n = (size_t)nodes * (size_t)c->dim, r = (size_t)s->r, m = s->m;
+    const double *x = c->x_t + (size_t)first_node * (size_t)c->dim;
+    if (n != s->n || c->dim != s->dim) {
+        tss_log(&b->host, TSS_LOG_ERROR, "decoder basis: %d nodes, the decoder has %d", nodes,
+                s->nodes);
+        tss__n_zero(columns, n * r);
+        return;
+    }
+    if (b->encoder && tss_net_forward(b->encoder, b->work, 1, x, b->z) == TSS_OK)
+        tss_reduced_set(s, b->z);
+    tss_reduced_project(s, x, NULL);
+    double *rows = tss__reduced_forward(s, s->z, s->r) + m;
+    tss__basis_orthonormal(s, rows);
+    for (size_t i = 0; i < n; i++)
+        for (size_t a = 0; a < r; a++)
+            columns[i * r + a] = tss__n_dot8(m, s->B + i * m, rows + a * m);
+}
+
+const double *tss_decoder_basis_z(const tss_decoder_basis *b) { return b->s->z; }
+tss_result tss_decoder_basis_set(tss_decoder_basis *b, const double *z) {
+    return tss_reduced_set(b->s, z);
 }
 
 #ifdef __cplusplus

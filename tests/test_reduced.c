@@ -8,7 +8,10 @@
 
 #define TSS_IMPLEMENTATION
 #include "tss.h"
+#include "tss_ipc.h"
+#include "tss_subspace.h"
 #include "tss_neural.h"
+#include "checker.h"
 #include <stdio.h>
 
 static tss_rng rng;
@@ -671,6 +674,231 @@ static void test_nan(void **state) {
     tss_net_destroy(n), scene_free(&s);
 }
 
+// ---- a decoder as a basis -------------------------------------------------------------------
+
+// f(z) = X + B mlp(z) with f(0) = X: no biases, and B is 0 at the pinned end.
+static tss_net *pinned_decoder(const scene *s, int r) {
+    tss_net_def d = tss_net_def_default();
+    int width[3] = {r, 8, 6};
+    double B[MOST * 6];
+    for (int i = 0; i < s->coords * 6; i++) {
+        double reach = s->X[i / 6 / s->dim * s->dim];
+        B[i] = 0.4 * reach * sin(0.9 * (i % 6 + 1) * reach + i / 6 % s->dim + 2 * (i % 6));
+    }
+    d.layers = 2, d.width = width, d.activation = TSS_SILU, d.seed = 4, d.outputs = s->coords;
+    d.out_base = s->X, d.out_matrix = B;
+    tss_net *n;
+    assert_int_equal(tss_net_create(NULL, &d, &n), TSS_OK);
+    double *p = tss_net_parameters(n);
+    for (int o = 0; o < 8; o++) p[r * 8 + o] = 0;
+    for (int o = 0; o < 6; o++) p[r * 8 + 8 + 8 * 6 + o] = 0;
+    for (int i = 0; i < r * 8; i++) p[i] *= 3;  // well curved
+    return n;
+}
+
+typedef struct bar {
+    scene s;
+    double lame[2], mass[MOST];
+    tss_world *w;
+    tss_net *n;
+    tss_decoder_basis *basis;
+    check *judge;
+} bar;
+
+static void bar_iterate(const double *x0, const double *x1, void *ctx) {
+    bar *b = (bar *)ctx;
+    if (b->judge) (void)check_segment(b->judge, x0, x1);
+}
+
+enum { BAR = 4 };
+
+static void bar_make(bar *b, int dim, tss_mode mode, double gravity, const tss_net *encoder) {
+    memset(b, 0, sizeof *b);
+    grid(&b->s, dim, 4, 1, 1, 1.5);
+    tss_elements_def ed = def_of(&b->s);
+    ed.E = 3e4, tss_lame(ed.E, ed.nu, &b->lame[0], &b->lame[1]);
+    assert_int_equal(tss_elements_create(NULL, &ed, &b->s.e), TSS_OK);
+    tss_world_def wd = tss_world_def_default();
+    tss_body_def bd = tss_body_def_default();
+    int pin[8], pins = 0;
+    for (int i = 0; i < b->s.nodes; i++)
+        if (b->s.X[i * dim] == 0) pin[pins++] = i;
+    wd.dim = dim, wd.dt = 0.05, wd.host.workers = 1, wd.tol = 1e-9;
+    wd.gravity[0] = wd.gravity[2] = 0, wd.gravity[1] = gravity;
+    wd.on_iterate = bar_iterate, wd.on_iterate_ctx = b;
+    assert_int_equal(tss_world_create(&wd, &b->w), TSS_OK);
+    bd.nodes = b->s.nodes, bd.X = b->s.X, bd.cells = b->s.cells, bd.cell = b->s.cell;
+    bd.pins = pins, bd.pin = pin, bd.material.kind = TSS_CUSTOM_MATERIAL;
+    bd.material.density = tss_neural_density, bd.material.user = b->lame, bd.material.has_C = 1;
+    bd.material.E = ed.E, bd.material.nu = ed.nu;
+    assert_int_equal(tss_body_add(b->w, &bd, NULL), TSS_OK);
+    assert_int_equal(tss_world_prepare(b->w), TSS_OK);
+    for (int i = 0; i < b->s.coords; i++) b->mass[i] = tss_world_masses(b->w)[i / dim];
+    b->n = pinned_decoder(&b->s, BAR);
+    assert_int_equal(tss_decoder_basis_create(NULL, dim, b->n, encoder, b->mass, NULL, &b->basis),
+                     TSS_OK);
+    tss_subspace_def sd = tss_subspace_def_default();
+    sd.mode = mode;
+    assert_int_equal(tss_subspace_add(b->w, &sd, NULL), TSS_OK);
+    tss_basis_def d = tss_basis_custom(BAR, NULL, tss_decoder_basis_refresh, b->basis);
+    assert_int_equal(tss_basis_add(b->w, 0, &d, NULL), TSS_OK);
+}
+
+static void bar_free(bar *b) {
+    tss_world_destroy(b->w), tss_decoder_basis_destroy(b->basis), tss_net_destroy(b->n);
+    tss_elements_destroy(b->s.e);
+}
+
+// One step from a state of the subspace, without nodes: the world moves in the tangent, the reduced
+// solver on the manifold. What lies between them is of second order in the displacement.
+static void test_basis_order(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        double last = 0;
+        for (double gravity = 0.5; gravity > 5e-3; gravity *= 0.25) {
+            bar b;
+            bar_make(&b, dim, TSS_MODE_SUBSPACE, gravity, NULL);
+            double force[MOST];
+            for (int i = 0; i < b.s.coords; i++) force[i] = i % dim == 1 ? b.mass[i] * gravity : 0;
+            tss_reduced_def d = tss_reduced_def_default();
+            tss_reduced *sim;
+            d.decoder = b.n, d.elements = b.s.e, d.mass = b.mass, d.eps = 1e-12, d.ftol = 0;
+            assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+            tss_reduced_set_force(sim, force);
+            tss_step_info info;
+            assert_int_equal(tss_world_step(b.w, &info), TSS_OK);
+            assert_int_equal(tss_reduced_step(sim, NULL), TSS_OK);
+            const double *x = tss_reduced_x(sim);
+            double moved = distance(x, b.s.X, (size_t)b.s.coords);
+            double gap = distance(x, tss_world_positions(b.w), (size_t)b.s.coords);
+            print_message("basis, %dD, gravity %.3f: moved %.2e, off by %.2e\n", dim, gravity,
+                          moved, gap);
+            assert_true(moved > 1e-5 && gap > 1e-12 && gap < 0.2 * moved);
+            if (last > 0) assert_true(gap < 0.1 * last);  // a sixteenth
+            last = gap;
+            tss_reduced_destroy(sim), bar_free(&b);
+        }
+    }
+}
+
+// The columns: orthonormal in M, and the span of differences of f.
+static void test_basis_columns(void **state) {
+    (void)state;
+    bar b;
+    bar_make(&b, 3, TSS_MODE_SUBSPACE, 0, NULL);
+    double z[BAR] = {0.4, -0.3, 0.2, 0.5}, near_[BAR] = {0.38, -0.28, 0.2, 0.5}, x[MOST], up[MOST],
+           down[MOST], U[MOST * BAR];
+    tss_work *work;
+    tss_work_create(NULL, &work);
+    tss_net_forward(b.n, work, 1, z, x);
+    tss_ctx c;
+    memset(&c, 0, sizeof c);
+    c.dim = 3, c.nodes = b.s.nodes, c.x_t = x;
+    assert_int_equal(tss_decoder_basis_set(b.basis, near_), TSS_OK);
+    tss_decoder_basis_refresh(b.basis, &c, 0, b.s.nodes, U);
+    assert_true(distance(tss_decoder_basis_z(b.basis), z, BAR) < 1e-6);
+    for (int p = 0; p < BAR; p++)
+        for (int q = 0; q <= p; q++) {
+            double s = 0;
+            for (int i = 0; i < b.s.coords; i++) s += b.mass[i] * U[i * BAR + p] * U[i * BAR + q];
+            if (!(fabs(s - (p == q)) < 1e-9)) fail_msg("columns %d, %d: %g", p, q, s);
+        }
+    for (int a = 0; a < BAR; a++) {
+        double keep = z[a], rest[MOST], all = 0;
+        z[a] = keep + 1e-5, tss_net_forward(b.n, work, 1, z, up);
+        z[a] = keep - 1e-5, tss_net_forward(b.n, work, 1, z, down);
+        z[a] = keep;
+        for (int i = 0; i < b.s.coords; i++) rest[i] = (up[i] - down[i]) / 2e-5;
+        all = norm(rest, (size_t)b.s.coords);
+        for (int p = 0; p < BAR; p++) {
+            double s = 0;
+            for (int i = 0; i < b.s.coords; i++) s += b.mass[i] * U[i * BAR + p] * rest[i];
+            for (int i = 0; i < b.s.coords; i++) rest[i] -= s * U[i * BAR + p];
+        }
+        assert_true(norm(rest, (size_t)b.s.coords) < 1e-6 * all);
+    }
+    // Another body: columns of 0.
+    for (int i = 0; i < MOST * BAR; i++) U[i] = 1;
+    tss_decoder_basis_refresh(b.basis, &c, 0, 3, U);
+    for (int i = 0; i < 9 * BAR; i++) assert_true(U[i] == 0);
+    tss_work_destroy(work), bar_free(&b);
+}
+
+// The adaptive solver with this basis: every step converges, nothing inverts, nodes are added; with
+// and without an encoder, whose z depends on the positions alone.
+static void test_basis_adaptive(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++)
+        for (int with = 0; with < 2; with++) {
+            bar b;
+            scene s;
+            tss_net *encoder = NULL;
+            grid(&s, dim, 4, 1, 1, 1.5);
+            if (with) {
+                tss_net_def d = tss_net_def_default();
+                int width[3] = {5, 6, BAR};
+                double *A = randoms((size_t)s.coords * 5, 0.1);
+                d.layers = 2, d.width = width, d.inputs = s.coords, d.in_base = s.X,
+                d.in_matrix = A;
+                assert_int_equal(tss_net_create(NULL, &d, &encoder), TSS_OK);
+                free(A);
+            }
+            bar_make(&b, dim, TSS_MODE_ADAPTIVE, -9.81, encoder);
+            check_mesh m;
+            memset(&m, 0, sizeof m);
+            int body[64] = {0}, all[64];
+            unsigned char fixed[64] = {0};
+            for (int i = 0; i < s.nodes; i++) fixed[i] = s.X[i * dim] == 0, all[i] = i;
+            m.dim = dim, m.nodes = s.nodes, m.rest = b.s.X, m.cells = b.s.cell,
+            m.n_cells = b.s.cells, m.body = body, m.kinematic = fixed, m.points = all,
+            m.n_points = s.nodes;
+            b.judge = check_begin(&m, tss_world_positions(b.w));
+            int most = 0;
+            double moved = 0;
+            for (int step = 0; step < 12; step++) {
+                tss_step_info info;
+                assert_int_equal(tss_world_step(b.w, &info), TSS_OK);
+                assert_int_equal(info.status, TSS_STEP_CONVERGED);
+                assert_true(info.min_J > 0 && info.active_modes <= BAR);
+                most = info.enriched_nodes > most ? info.enriched_nodes : most;
+                moved = fmax(moved, distance(tss_world_positions(b.w), b.s.X, (size_t)b.s.coords));
+            }
+            check_report r = check_end(b.judge);
+            assert_true(r.ok);
+            print_message("adaptive, %dD: moved %.2f, up to %d of %d nodes\n", dim, moved, most,
+                          b.s.nodes);
+            assert_true(moved > 0.1);
+            bar_free(&b), tss_net_destroy(encoder);
+        }
+}
+
+static void test_basis_refusals(void **state) {
+    (void)state;
+    scene s;
+    scene_make(&s, 3, 3, 1, 1);
+    tss_net *n = decoder_of(&s, 3, TSS_SILU, SCATTER);
+    tss_host h = tss_host_default();
+    tss_decoder_basis *b;
+    double nan3[3] = {0, NAN, 0};
+    h.alloc = stingy_alloc, h.free = stingy_free, h.log = keep_log, allowance = 100;
+    assert_int_equal(tss_decoder_basis_create(&h, 4, n, NULL, NULL, NULL, &b),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_decoder_basis_create(&h, 3, n, n, NULL, NULL, &b), TSS_ERROR_BAD_ARGUMENT);
+    assert_non_null(strstr(logged, "encoder"));
+    assert_int_equal(tss_decoder_basis_create(&h, 3, n, NULL, NULL, nan3, &b),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(held, 0);
+    int limit = 0;
+    for (allowance = 0; tss_decoder_basis_create(&h, 3, n, NULL, NULL, NULL, &b) != TSS_OK;
+         allowance = ++limit)
+        assert_true(b == NULL && held == 0);
+    assert_true(limit > 3);
+    assert_int_equal(tss_decoder_basis_set(b, nan3), TSS_ERROR_BAD_STATE);
+    tss_decoder_basis_destroy(b);
+    assert_int_equal(held, 0);
+    tss_net_destroy(n), scene_free(&s);
+}
+
 static int setup(void **state) {
     (void)state;
     rng = tss_rng_seed(5);
@@ -680,8 +908,13 @@ static int setup(void **state) {
 int main(void) {
 #define T(f) cmocka_unit_test_setup(f, setup)
     const struct CMUnitTest tests[] = {
-        T(test_energy), T(test_lanes),   T(test_eigen),  T(test_newton),   T(test_contact_rest),
-        T(test_sdf),    T(test_project), T(test_memory), T(test_refusals), T(test_nan),
+        T(test_energy),         T(test_lanes),
+        T(test_eigen),          T(test_newton),
+        T(test_contact_rest),   T(test_sdf),
+        T(test_project),        T(test_memory),
+        T(test_refusals),       T(test_nan),
+        T(test_basis_order),    T(test_basis_columns),
+        T(test_basis_adaptive), T(test_basis_refusals),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
