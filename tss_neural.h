@@ -27,7 +27,7 @@
  *
  * tss_cubature_select (Eq. 11) finds few cells that stand for all of them in training; tss_reduced
  * (Eq. 2) simulates with a trained decoder, with scripted handles and contact against a signed
- * distance.
+ * distance; tss_decoder_basis makes it a basis of the adaptive simulator (tss_subspace.h).
  *
  * Jets: for directions D_a, a < k, and one symmetric matrix C (k × k) a pass carries
  *     y,   y_a = ∂_a y,   y_2 = Σ_ab C_ab ∂_a ∂_b y
@@ -47,7 +47,8 @@
  *     W[i·outputs + o]), then b (outputs). y = activation(x W + b), the last layer without σ.
  *     x: coordinates, node by node, as in tss.h. r: inputs of the decoder. Gradients are *added* to
  *     arrays named ..._bar, other outputs are overwritten. Symbols are paper B's: z, f, g, P, L_C,
- *     L_LS, λ, σ, M (a mass for each coordinate).
+ *     L_LS, λ, σ, M (a mass for each coordinate). Limits: k <= 32768 directions, batch·(k + 2) <
+ *     2^31 (an exact Hessian has k = r), else BAD_ARGUMENT.
  */
 #ifndef TSS_NEURAL_H
 #define TSS_NEURAL_H
@@ -166,10 +167,10 @@ TSS_API tss_result tss_net_jets(const tss_net *net, tss_work *work, int batch, i
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_elements_def {
-    int dim;  // 3 (default): tetrahedra; 2: triangles
-    int nodes;
+    int dim;          // 3 (default): tetrahedra; 2: triangles
+    int nodes;        // 1..2^28
     const double *X;  // rest positions, nodes × dim, m
-    int cells;
+    int cells;        // 1..2^27
     const int *cell;  // cells × (dim + 1), positive volume (but see shell)
     double E, nu;     // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
     // Triangles in space: thickness, m, > 0, with dim 3 and cells × 3 nodes of positive area;
@@ -941,6 +942,11 @@ void tss_net_set_scale(tss_net *n, double s) { n->scale = s; }
 // The tangent of the first-order reverse pass, for Hessians: b' = σ' b, b'_a = σ' b_a + σ'' s_a b.
 // ---------------------------------------------------------------------------------------------
 
+// 1: k² and rows of a batch of jets are numbers that an int holds.
+static int tss__n_sizes(int batch, int k) {
+    return batch >= 1 && k >= 0 && k <= 32768 && (double)batch * ((double)k + 2) < 2147483647.0;
+}
+
 typedef struct tss__jetpass {
     const tss_net *net;
     int batch, k, second, cols, chunks;
@@ -1259,7 +1265,7 @@ static void tss__n_forward_task(int c, int worker, void *arg) {
 
 tss_result tss_net_jets(const tss_net *n, tss_work *w, int batch, int k, const double *z,
                         const double *D, const double *C, double *x, double *x1, double *x2) {
-    if (batch < 1 || k < 0 || (k > 0 && !D) || (k > 0 && n->has_in) || (x2 && !C))
+    if (!tss__n_sizes(batch, k) || (k > 0 && !D) || (k > 0 && n->has_in) || (x2 && !C))
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_job j;
     tss__n_slab s = {NULL, 0, 0};
@@ -1308,7 +1314,7 @@ static void tss__n_backward_task(int c, int worker, void *arg) {
 
 tss_result tss_net_backward(const tss_net *n, tss_work *w, int batch, const double *in,
                             const double *out_bar, double *theta_bar, double *in_bar) {
-    if (batch < 1 || !out_bar) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(batch, 0) || !out_bar) return TSS_ERROR_BAD_ARGUMENT;
     tss__n_job j;
     tss__n_slab s = {NULL, 0, 0};
     int what = theta_bar ? TSS__PASS_THETA : 0;
@@ -1486,9 +1492,9 @@ static const char *tss__elements_complaint(const tss_elements_def *d, tss_result
     *r = TSS_ERROR_BAD_ARGUMENT;
     int count = d->subset ? d->count : d->cells;
     if (d->dim != 2 && d->dim != 3) return "elements: dim must be 2 or 3";
-    if (d->nodes < 1 || d->nodes > (1 << 28) || d->cells < 1 || d->cells > (1 << 28) || count < 1 ||
+    if (d->nodes < 1 || d->nodes > (1 << 28) || d->cells < 1 || d->cells > (1 << 27) || count < 1 ||
         count > d->cells)
-        return "elements: nodes, cells and the subset must not be empty";
+        return "elements: nodes must be 1..2^28, cells 1..2^27, a subset 1..cells";
     if (!d->X || !d->cell || !d->mu != !d->lambda)
         return "elements: X, cell or one of mu, lambda missing";
     for (int i = 0; d->subset && i < count; i++)
@@ -2209,7 +2215,8 @@ tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, cons
                              const double *C, const double *x2, double *P, double *P1, double *P2,
                              double alpha, const double *beta, double gamma, double *x_bar,
                              double *x1_bar, double *x2_bar) {
-    if (k < 0 || (k > 0 && !x1) || !C != !x2 || (C && k == 0)) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(1, k) || (k > 0 && !x1) || !C != !x2 || (C && k == 0))
+        return TSS_ERROR_BAD_ARGUMENT;
     size_t n = (size_t)(e->nodes * e->dim), wide = n * sizeof(double), K = (size_t)k;
     size_t cols = 1 + K + (C != NULL), count = 2 * cols * n + TSS__N_CELL * (3 * cols + 2);
     double *p = (double *)tss_alloc(&e->host, count * sizeof(double));
@@ -2330,7 +2337,8 @@ static void tss__n_identity(double *D, int r) {
 
 tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
                                  const double *z, double *P, double *gradient, double *hessian) {
-    if (batch < 1 || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(batch, hessian ? n->width[0] : 0) || !tss__n_fits(n, e))
+        return TSS_ERROR_BAD_ARGUMENT;
     tss__n_reduced j;
     tss__n_slab s = {NULL, 0, 0};
     int r = n->width[0], k = hessian ? r : 0;
@@ -2353,7 +2361,7 @@ tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_wo
 
 tss_result tss_reduced_second(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
                               const double *z, const double *u, const double *v, double *out) {
-    if (batch < 1 || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(batch, 2) || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
     tss__n_reduced j;
     tss__n_slab s = {NULL, 0, 0};
     size_t r = (size_t)n->width[0], B = (size_t)batch;
@@ -2419,7 +2427,8 @@ static void tss__recon_task(int c, int worker, void *arg) {
 tss_result tss_loss_reconstruction(const tss_net *dec, const tss_net *enc, tss_work *w,
                                    const double *mass, int batch, const double *x, double weight,
                                    double *loss, double *decoder_bar, double *encoder_bar) {
-    if (batch < 1 || dec->has_in || enc->outputs != dec->inputs || enc->inputs != dec->outputs)
+    if (!tss__n_sizes(batch, 0) || dec->has_in || enc->outputs != dec->inputs ||
+        enc->inputs != dec->outputs)
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_recon j;
     tss__n_slab s = {NULL, 0, 0};
@@ -2493,7 +2502,7 @@ tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_
                                  const double *mass, double lambda, double sigma, double eps,
                                  int batch, const double *z, double weight, double *loss,
                                  double *parts, double *decoder_bar) {
-    if (batch < 2 || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
+    if (batch < 2 || !tss__n_sizes(batch, 0) || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_unsup j;
     tss__n_slab s = {NULL, 0, 0};
@@ -2681,7 +2690,8 @@ static void tss__lip_reverse(tss__n_lip *l, tss_work *w) {
 static int tss__lip_valid(const tss_net *n, const tss_elements *e, const tss_lipschitz_def *d,
                           int batch, const double *probe) {
     int random = d->estimator != TSS_LIPSCHITZ_EXACT;
-    return batch >= 2 && tss__n_fits(n, e) && d->order >= 0 && d->order <= 2 &&
+    return batch >= 2 && tss__n_sizes(batch, d->order == 2 ? n->width[0] : 2) &&
+           tss__n_fits(n, e) && d->order >= 0 && d->order <= 2 &&
            (unsigned)d->estimator <= TSS_LIPSCHITZ_U && d->floor >= 0 && d->floor < 1e300 &&
            (!random || (d->order == 2 && probe && d->probes >= 1 && d->probes <= n->width[0]));
 }
@@ -2996,7 +3006,7 @@ tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work
                                int *subset, double *weight, int *count, double *error) {
     *count = 0;
     if (!tss__n_fits(n, e) || samples < 1 || def->count < 1 || def->candidates < 0 ||
-        !(def->tol >= 0) || (double)samples * n->inputs > 1e9)
+        !(def->tol >= 0) || !tss__n_sizes(samples, n->inputs) || (double)samples * n->inputs > 1e9)
         return TSS_ERROR_BAD_ARGUMENT;
     tss__cub c;
     tss__n_slab s = {NULL, 0, 0};

@@ -646,6 +646,42 @@ static void test_refusals(void **state) {
     tss_reduced_destroy(sim), tss_net_destroy(n), scene_free(&s);
 }
 
+// Sizes whose products would not fit an int are refused before anything is read.
+static void test_sizes(void **state) {
+    (void)state;
+    scene s;
+    scene_make(&s, 2, 3, 1, 1);
+    tss_net *n = decoder_of(&s, 3, TSS_SILU, NARROW);
+    const int big = 2147483647;
+    double one[8] = {0};
+    tss_elements_def d = def_of(&s);
+    tss_elements *e;
+    assert_int_equal(tss_net_jets(n, s.work, 1, 40000, one, one, NULL, one, NULL, NULL),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_net_jets(n, s.work, 1 << 20, 3000, one, one, NULL, one, NULL, NULL),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_net_forward(n, s.work, big, one, one), TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_net_backward(n, s.work, big, one, one, NULL, NULL),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_reduced_potential(n, s.e, s.work, big, one, one, NULL, NULL),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_reduced_second(n, s.e, s.work, big / 2, one, one, one, one),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_lipschitz_estimate(n, s.e, s.work, 2, big, one, one),
+                     TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(
+        tss_loss_unsupervised(n, s.e, s.work, NULL, 1, 1, 0, big, one, 1, one, NULL, NULL),
+        TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_elements_jets(s.e, 40000, one, one, NULL, NULL, one, NULL, NULL, 1, NULL,
+                                       0, NULL, NULL, NULL),
+                     TSS_ERROR_BAD_ARGUMENT);
+    d.cells = 1 << 28;
+    assert_int_equal(tss_elements_create(NULL, &d, &e), TSS_ERROR_BAD_ARGUMENT);
+    d = def_of(&s), d.nodes = big;
+    assert_int_equal(tss_elements_create(NULL, &d, &e), TSS_ERROR_BAD_ARGUMENT);
+    tss_net_destroy(n), scene_free(&s);
+}
+
 // A wall that says nothing (NaN) ends the line search, and the state stays what it was.
 static double no_answer(void *user, const double *x, double *n) {
     (void)user, (void)x;
@@ -908,13 +944,21 @@ static int setup(void **state) {
 int main(void) {
 #define T(f) cmocka_unit_test_setup(f, setup)
     const struct CMUnitTest tests[] = {
-        T(test_energy),         T(test_lanes),
-        T(test_eigen),          T(test_newton),
-        T(test_contact_rest),   T(test_sdf),
-        T(test_project),        T(test_memory),
-        T(test_refusals),       T(test_nan),
-        T(test_basis_order),    T(test_basis_columns),
-        T(test_basis_adaptive), T(test_basis_refusals),
+        T(test_energy),
+        T(test_lanes),
+        T(test_eigen),
+        T(test_newton),
+        T(test_contact_rest),
+        T(test_sdf),
+        T(test_project),
+        T(test_memory),
+        T(test_refusals),
+        T(test_sizes),
+        T(test_nan),
+        T(test_basis_order),
+        T(test_basis_columns),
+        T(test_basis_adaptive),
+        T(test_basis_refusals),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
