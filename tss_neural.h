@@ -1035,7 +1035,7 @@ static void tss__jetpass_load(const tss__jetpass *p, int c, const double *in, co
             for (size_t i = 0; i < full; i++) moved[(size_t)s * full + i] = x[i] - n->in_base[i];
         else
             memcpy(row, x, r * sizeof(double));
-        if (p->k)
+        if (p->k && D)
             memcpy(row + r, D + (size_t)(first + s) * stride, (size_t)p->k * r * sizeof(double));
     }
     if (n->has_in)
