@@ -26,8 +26,8 @@
  *     tss_model_write(NULL, &m, "bar.tssn");
  *
  * tss_cubature_select (Eq. 11) finds few cells that stand for all of them in training; tss_reduced
- * (Eq. 2) simulates with a trained decoder. Not here yet: projected Newton, scripted handles and
- * contact in tss_reduced.
+ * (Eq. 2) simulates with a trained decoder, with scripted handles and contact against a signed
+ * distance; tss_decoder_basis makes it a basis of the adaptive simulator (tss_subspace.h).
  *
  * Jets: for directions D_a, a < k, and one symmetric matrix C (k × k) a pass carries
  *     y,   y_a = ∂_a y,   y_2 = Σ_ab C_ab ∂_a ∂_b y
@@ -47,7 +47,8 @@
  *     W[i·outputs + o]), then b (outputs). y = activation(x W + b), the last layer without σ.
  *     x: coordinates, node by node, as in tss.h. r: inputs of the decoder. Gradients are *added* to
  *     arrays named ..._bar, other outputs are overwritten. Symbols are paper B's: z, f, g, P, L_C,
- *     L_LS, λ, σ, M (a mass for each coordinate).
+ *     L_LS, λ, σ, M (a mass for each coordinate). Limits: k <= 32768 directions, batch·(k + 2) <
+ *     2^31 (an exact Hessian has k = r), else BAD_ARGUMENT.
  */
 #ifndef TSS_NEURAL_H
 #define TSS_NEURAL_H
@@ -157,15 +158,25 @@ TSS_API tss_result tss_net_jets(const tss_net *net, tss_work *work, int batch, i
 // zero with no stress at rest, linear elasticity with μ and λ for small strain, finite when
 // inverted. A polynomial in F: third derivatives are short. tss_neural_density gives a tss.h
 // material with it.
+// Shells (cloth): the same Ψ in two dimensions of triangles in space, F 3 × 2, J = √det FᵀF, vol =
+// area · thickness; and hinges (Grinspun et al. 2003, Discrete Shells)
+//     Σ k (θ − θ̄)² 3 ‖ē‖² / Ā,
+// θ the angle between the normals of two cells at an edge, θ̄ that of X, ē the edge and Ā the sum of
+// both areas at rest. θ is in (−π, π): a hinge must not fold through itself. Half of a hinge
+// belongs to either cell: with weights it counts ½ (w_1 + w_2), cells out of the subset with 0.
 // ---------------------------------------------------------------------------------------------
 
 typedef struct tss_elements_def {
-    int dim;  // 3 (default): tetrahedra; 2: triangles
-    int nodes;
+    int dim;          // 3 (default): tetrahedra; 2: triangles
+    int nodes;        // 1..2^28
     const double *X;  // rest positions, nodes × dim, m
-    int cells;
-    const int *cell;            // cells × (dim + 1), positive volume
-    double E, nu;               // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
+    int cells;        // 1..2^27
+    const int *cell;  // cells × (dim + 1), positive volume (but see shell)
+    double E, nu;     // Pa > 0, −1 < nu < 0.5; defaults 1e5, 0.4
+    // Triangles in space: thickness, m, > 0, with dim 3 and cells × 3 nodes of positive area;
+    // default 0: none. J is then the ratio of areas and cannot be negative.
+    double shell;
+    double bending;  // k of a shell's hinges, J (N·m), >= 0; default 0. Edges of at most two cells
     const double *mu, *lambda;  // of each cell, Pa, in place of E and nu; both or NULL
     int count;                  // subset of cells (cubature, Eq. 11); used if subset is not NULL
     const int *subset;          // count cells, each at most once
@@ -394,9 +405,14 @@ TSS_API tss_result tss_training_step(tss_training *t, tss_training_info *info);
 
 // ---------------------------------------------------------------------------------------------
 // >>reduced_solver (public)
-// Eq. (2) by L-BFGS with backtracking: each step finds z that minimises
-//     E(z) = ‖f(z) − q̄‖²_M / (2h²) + P(f(z)) − force·f(z),   q̄ = 2 x_t − x_{t−1},
-// or, when h = 0 (quasi-static), the same without the first term.
+// Eq. (2): each step finds z that minimises
+//     E(z) = ‖f(z) − q̄‖²_M / (2h²) + P(f(z)) + C(f(z)) − force·f(z),   q̄ = 2 x_t − x_{t−1},
+// or, when h = 0 (quasi-static), the same without the first term. C is a penalty against a signed
+// distance φ (§5.2):
+//     C(x) = ½ k Σ_i a_i min(0, φ(x_i) − margin)².
+// f is affine in its last hidden layer: the first and last terms cost what a layer costs, and with
+// a cubature (elements of a subset) and a list of contact nodes a step does not depend on the size
+// of the mesh.
 // ---------------------------------------------------------------------------------------------
 
 typedef enum tss_exit {    // the paper's four (§5)
@@ -407,16 +423,38 @@ typedef enum tss_exit {    // the paper's four (§5)
     TSS_EXITS
 } tss_exit;
 
+typedef enum tss_reduced_method {
+    TSS_LBFGS,
+    // The exact Hessian of E in z (the curvature of f included; of C without ∇²φ), its negative
+    // eigenvalues put to 0, and `shift` added to all. r <= 1024; costs r + 1 columns an iteration.
+    TSS_PROJECTED_NEWTON,
+} tss_reduced_method;
+
 typedef struct tss_reduced_def {
-    const tss_net *decoder;        // borrowed, as is the rest
-    const tss_elements *elements;  // all, or a cubature
-    const double *mass;            // of each coordinate, kg; required when h > 0
+    // Its last layers and maps are copied; the layers before are borrowed. Neither may change.
+    const tss_net *decoder;
+    const tss_elements *elements;  // all, or a cubature; borrowed
+    const double *mass;            // of each coordinate, kg, copied; required when h > 0; NULL: 1
     const double *start;           // r numbers; NULL: 0
     double h;                      // s; 0: quasi-static. Default 0.05
     double eps;                    // J per unit of z, >= 0; default 1e-5
     double ftol;  // 0 <= ftol; default 2.2e-9 (L-BFGS-B's, which the paper's code uses); 0: never
     int memory;   // pairs, 1..64; default 10
     int max_line, max_iterations;  // defaults 128, 1024
+    tss_reduced_method solver;     // default TSS_LBFGS
+    double shift;  // PROJECTED_NEWTON: > 0, J per unit of z², absolute as in the paper's code (so
+                   // it depends on the scale of z and of the energy); default 1e-6
+    // Signed distance at x (dim numbers), m, negative inside; writes its gradient, of length 1, to
+    // n (dim). NULL (default): no contact. Called in every evaluation, from the thread that steps.
+    // An obstacle moves if what sdf_user points to is changed between steps.
+    double (*sdf)(void *user, const double *x, double *n);
+    void *sdf_user;
+    double contact_stiffness;  // k >= 0; N/m if a is a number, N/m³ for an area, 1/s² for a mass;
+                               // default 0
+    double contact_margin;     // m; default 0
+    int contact_count;         // nodes that are tested; used if contact_node is not NULL
+    const int *contact_node;   // each at most once; copied. NULL (default): every node
+    const double *contact_weight;  // a_i >= 0 of each of them, copied; NULL: 1
     int cookie;
 } tss_reduced_def;
 TSS_API tss_reduced_def tss_reduced_def_default(void);
@@ -425,25 +463,82 @@ typedef struct tss_reduced_info {
     tss_exit exit;
     int iterations, evaluations;  // of E with its gradient
     double energy, gradient;      // E and ‖∇E‖∞ at the end
+    int hessians;                 // of PROJECTED_NEWTON
 } tss_reduced_info;
 
-typedef struct tss_reduced tss_reduced;  // opaque
-// Errors: BAD_ARGUMENT (the log says what), BAD_STATE (start or f(start) not finite), NO_MEMORY;
-// *out is then NULL.
+typedef struct tss_reduced tss_reduced;  // opaque; one thread at a time, tss_reduced_x included
+// Memory: 2 copies of the last layer (coordinates × width), the second only of the rows that
+// elements and contact touch. Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then
+// NULL.
 TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
                                       tss_reduced **out);
 TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
 // One step; starts from z_t, or from 2 z_t − z_{t−1} where E is lower. Allocates nothing. info may
 // be NULL. Errors: none; how it ended is info.exit, and the state is the best that was found.
 TSS_API tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *info);
-// At rest in f(z). Errors: BAD_STATE (z or f(z) not finite); the state is then as it was.
+// At rest in f(z), handles where they are. Errors: BAD_STATE (not finite), the state is as before.
 TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);
+// At rest in the f(z) that minimises ½‖f(z) − x‖²_M (without handles), from the current z, by
+// projected Newton (L-BFGS if r > 1024). x: coordinates, m. info (NULL allowed): energy is that
+// minimum, gradient of it; CONVERGED: the next iteration would move f by less than 1e-10 of the
+// size of x, both in ‖·‖_M. Not counted in tss_reduced_exits. Allocates nothing. Errors:
+// BAD_ARGUMENT (x is not finite), the state is as before.
+TSS_API tss_result tss_reduced_project(tss_reduced *s, const double *x, tss_reduced_info *info);
+// Scripted nodes: in the steps to come node[k] is at x[k] (count × dim, m) and not where f(z) puts
+// it, until changed; count 0: none. What they do to E does not move z but through the elements
+// they share with other nodes. Copied; allocates nothing; cheaper if the nodes stay the same.
+// Errors: BAD_ARGUMENT (node out of range or twice, not finite; the log says what), nothing changes
+// then.
+TSS_API tss_result tss_reduced_set_handles(tss_reduced *s, int count, const int *node,
+                                           const double *x);
 // Force on each coordinate, N, until changed; copied. NULL: none.
 TSS_API void tss_reduced_set_force(tss_reduced *s, const double *force);
 TSS_API const double *tss_reduced_z(const tss_reduced *s);  // r
-TSS_API const double *tss_reduced_x(const tss_reduced *s);  // coordinates, f(z)
+// Coordinates: f(z), handles where they are. Decoded by the first call after a step.
+TSS_API const double *tss_reduced_x(const tss_reduced *s);
 TSS_API const uint64_t *tss_reduced_exits(
     const tss_reduced *s);  // TSS_EXITS counts since the start
+
+// Signed distances for tss_reduced_def.sdf; user points to the struct.
+typedef struct tss_ball {  // φ = ‖x − center‖ − radius
+    int dim;
+    double center[3], radius;  // m
+} tss_ball;
+typedef struct tss_halfspace {  // φ = normal·(x − point): what lies against the normal is inside
+    int dim;
+    double point[3], normal[3];  // m; of length 1
+} tss_halfspace;
+TSS_API double tss_sdf_ball(void *ball, const double *x, double *n);
+TSS_API double tss_sdf_halfspace(void *halfspace, const double *x, double *n);
+
+// ---------------------------------------------------------------------------------------------
+// >>decoder_basis (public)
+// A decoder as a basis of the adaptive simulator (tss_subspace.h, tss_basis_custom): its tangent
+// ∂f/∂z at the z whose f(z) is nearest to the body, anew in every step,
+//     tss_decoder_basis *b;
+//     tss_decoder_basis_create(NULL, 3, decoder, NULL, mass, NULL, &b);
+//     tss_basis_def d = tss_basis_custom(r, NULL, tss_decoder_basis_refresh, b);
+//     tss_basis_add(world, body, &d, NULL);
+// which the oracle then enriches with nodes where it does not suffice.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct tss_decoder_basis tss_decoder_basis;  // opaque; one body, as long as its world
+// The decoder (no in_matrix, r <= 1024 inputs) gives the coordinates of all nodes of the body in
+// its order; both nets are borrowed and must not change. encoder (NULL allowed): z is looked for
+// from g(x), and depends on x alone; without one from the last z, so that a run that is resumed
+// must put it back with tss_decoder_basis_set. mass: of each coordinate, copied; NULL: 1. z: where
+// it starts, NULL: 0. Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+TSS_API tss_result tss_decoder_basis_create(const tss_host *host, int dim, const tss_net *decoder,
+                                            const tss_net *encoder, const double *mass,
+                                            const double *z, tss_decoder_basis **out);
+TSS_API void tss_decoder_basis_destroy(tss_decoder_basis *b);  // NULL allowed
+// For tss_basis_custom, with b as user. Column a is the part of ∂f/∂z_a that is orthogonal in M to
+// those before it, of unit norm: the same span, well conditioned (0 where there is no such part).
+// A body of another number of nodes: columns of 0, and an error in the log. Allocates nothing.
+TSS_API void tss_decoder_basis_refresh(void *b, const tss_ctx *c, int first_node, int nodes,
+                                       double *columns);
+TSS_API const double *tss_decoder_basis_z(const tss_decoder_basis *b);  // r, of the last refresh
+TSS_API tss_result tss_decoder_basis_set(tss_decoder_basis *b, const double *z);  // or BAD_STATE
 
 #ifdef __cplusplus
 }
@@ -849,6 +944,11 @@ void tss_net_set_scale(tss_net *n, double s) { n->scale = s; }
 // The tangent of the first-order reverse pass, for Hessians: b' = σ' b, b'_a = σ' b_a + σ'' s_a b.
 // ---------------------------------------------------------------------------------------------
 
+// 1: k² and rows of a batch of jets are numbers that an int holds.
+static int tss__n_sizes(int batch, int k) {
+    return batch >= 1 && k >= 0 && k <= 32768 && (double)batch * ((double)k + 2) < 2147483647.0;
+}
+
 typedef struct tss__jetpass {
     const tss_net *net;
     int batch, k, second, cols, chunks;
@@ -937,7 +1037,7 @@ static void tss__jetpass_load(const tss__jetpass *p, int c, const double *in, co
             for (size_t i = 0; i < full; i++) moved[(size_t)s * full + i] = x[i] - n->in_base[i];
         else
             memcpy(row, x, r * sizeof(double));
-        if (p->k)
+        if (p->k && D)
             memcpy(row + r, D + (size_t)(first + s) * stride, (size_t)p->k * r * sizeof(double));
     }
     if (n->has_in)
@@ -1167,7 +1267,7 @@ static void tss__n_forward_task(int c, int worker, void *arg) {
 
 tss_result tss_net_jets(const tss_net *n, tss_work *w, int batch, int k, const double *z,
                         const double *D, const double *C, double *x, double *x1, double *x2) {
-    if (batch < 1 || k < 0 || (k > 0 && !D) || (k > 0 && n->has_in) || (x2 && !C))
+    if (!tss__n_sizes(batch, k) || (k > 0 && !D) || (k > 0 && n->has_in) || (x2 && !C))
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_job j;
     tss__n_slab s = {NULL, 0, 0};
@@ -1216,7 +1316,7 @@ static void tss__n_backward_task(int c, int worker, void *arg) {
 
 tss_result tss_net_backward(const tss_net *n, tss_work *w, int batch, const double *in,
                             const double *out_bar, double *theta_bar, double *in_bar) {
-    if (batch < 1 || !out_bar) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(batch, 0) || !out_bar) return TSS_ERROR_BAD_ARGUMENT;
     tss__n_job j;
     tss__n_slab s = {NULL, 0, 0};
     int what = theta_bar ? TSS__PASS_THETA : 0;
@@ -1247,16 +1347,24 @@ tss_result tss_net_backward(const tss_net *n, tss_work *w, int batch, const doub
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__ELEMENTS_COOKIE 0x656c65
+#define TSS__N_CELL 12  // numbers of a cell or hinge in a column of scratch
 
 struct tss_elements {
     tss_host host;
     int dim, nodes, cells;  // cells: of the subset
+    int per;                // nodes of a cell
+    int hinges;             // of a shell
     int used;               // nodes that have a cell
     void *p;                // one block
     size_t bytes;
     double *Dinv, *vol, *mu, *la;  // cells × d², then w·vol, μ, λ'
     int *cell, *local;             // cells × (d+1): nodes; the same, numbered within dof
     int *dof;                      // used × d coordinates
+    double thick;                  // of a shell, m; 0: not one. Its Dinv are 2 × 2
+    double *rest, *hinge_weight;   // one block, hinges: θ̄; the shares of the two cells
+    int *hinge, *hinge_local;      // hinges × 4 nodes: an edge, the nodes across
+    int *cell_hinge;               // cells × 3: 2·hinge + which of its cells this is, −1: none
+    size_t hinge_bytes;
 };
 
 static void tss__mat_cross(const double A[9], const double B[9], double out[9]) {
@@ -1386,9 +1494,9 @@ static const char *tss__elements_complaint(const tss_elements_def *d, tss_result
     *r = TSS_ERROR_BAD_ARGUMENT;
     int count = d->subset ? d->count : d->cells;
     if (d->dim != 2 && d->dim != 3) return "elements: dim must be 2 or 3";
-    if (d->nodes < 1 || d->nodes > (1 << 28) || d->cells < 1 || d->cells > (1 << 28) || count < 1 ||
+    if (d->nodes < 1 || d->nodes > (1 << 28) || d->cells < 1 || d->cells > (1 << 27) || count < 1 ||
         count > d->cells)
-        return "elements: nodes, cells and the subset must not be empty";
+        return "elements: nodes must be 1..2^28, cells 1..2^27, a subset 1..cells";
     if (!d->X || !d->cell || !d->mu != !d->lambda)
         return "elements: X, cell or one of mu, lambda missing";
     for (int i = 0; d->subset && i < count; i++)
@@ -1402,8 +1510,14 @@ static const char *tss__elements_complaint(const tss_elements_def *d, tss_result
     for (int i = 0; d->mu && i < d->cells; i++)
         if (!(d->mu[i] > 0 && d->mu[i] < 1e300 && d->lambda[i] > -d->mu[i] && d->lambda[i] < 1e300))
             return "elements: mu must be > 0 and lambda > −mu";
+    if (!(d->shell >= 0 && d->shell < 1e300 && d->bending >= 0 && d->bending < 1e300))
+        return "elements: shell or bending is negative or not finite";
+    *r = TSS_ERROR_BAD_ARGUMENT;
+    if (d->shell > 0 && d->dim != 3) return "elements: a shell is in space (dim 3)";
+    if (d->bending > 0 && !(d->shell > 0)) return "elements: bending needs a shell";
     *r = TSS_ERROR_BAD_MESH;
-    for (int i = 0; i < d->cells * (d->dim + 1); i++)
+    int per = d->shell > 0 ? 3 : d->dim + 1;
+    for (int i = 0; i < d->cells * per; i++)
         if (d->cell[i] < 0 || d->cell[i] >= d->nodes)
             return "elements: a cell names a node out of range";
     for (int i = 0; i < d->nodes * d->dim; i++)
@@ -1428,12 +1542,301 @@ static double tss__cell_rest(int d, const double *X, const int *v, double *Dinv)
     return det / (d == 3 ? 6 : 2);
 }
 
+// ---- shells ---------------------------------------------------------------------------------
+// Their gradients are written once, over hyper-dual numbers (Fike and Alonso 2011): v + a ε₁ + b ε₂
+// + ab ε₁ε₂ with ε₁² = ε₂² = 0. At x + ε₁A + ε₂B they give ∇, D_A∇, D_B∇ and D²_AB∇, exactly.
+
+typedef struct tss__hd {
+    double v, a, b, ab;
+} tss__hd;
+
+static tss__hd tss__hd_of(double v) {
+    tss__hd r = {v, 0, 0, 0};
+    return r;
+}
+static tss__hd tss__hd_add(tss__hd x, tss__hd y) {
+    tss__hd r = {x.v + y.v, x.a + y.a, x.b + y.b, x.ab + y.ab};
+    return r;
+}
+static tss__hd tss__hd_sub(tss__hd x, tss__hd y) {
+    tss__hd r = {x.v - y.v, x.a - y.a, x.b - y.b, x.ab - y.ab};
+    return r;
+}
+static tss__hd tss__hd_scale(double f, tss__hd x) {
+    tss__hd r = {f * x.v, f * x.a, f * x.b, f * x.ab};
+    return r;
+}
+static tss__hd tss__hd_mul(tss__hd x, tss__hd y) {
+    tss__hd r = {x.v * y.v, x.v * y.a + x.a * y.v, x.v * y.b + x.b * y.v,
+                 x.v * y.ab + x.a * y.b + x.b * y.a + x.ab * y.v};
+    return r;
+}
+// f(x) of a function with value f0 and derivatives f1, f2 at x.v.
+static tss__hd tss__hd_chain(tss__hd x, double f0, double f1, double f2) {
+    tss__hd r = {f0, f1 * x.a, f1 * x.b, f1 * x.ab + f2 * x.a * x.b};
+    return r;
+}
+static tss__hd tss__hd_inverse(tss__hd x) {
+    double i = 1 / x.v;
+    return tss__hd_chain(x, i, -i * i, 2 * i * i * i);
+}
+static tss__hd tss__hd_sqrt(tss__hd x) {
+    double s = sqrt(x.v);
+    return tss__hd_chain(x, s, 0.5 / s, -0.25 / (s * x.v));
+}
+static tss__hd tss__hd_dot(const tss__hd *x, const tss__hd *y) {
+    return tss__hd_add(tss__hd_add(tss__hd_mul(x[0], y[0]), tss__hd_mul(x[1], y[1])),
+                       tss__hd_mul(x[2], y[2]));
+}
+static void tss__hd_cross(const tss__hd *x, const tss__hd *y, tss__hd *out) {
+    for (int i = 0; i < 3; i++) {
+        int j = (i + 1) % 3, k = (i + 2) % 3;
+        out[i] = tss__hd_sub(tss__hd_mul(x[j], y[k]), tss__hd_mul(x[k], y[j]));
+    }
+}
+// The angle of (x, y): that at the base, and the arc tangent (whose second derivative is 0 there)
+// of what is left of it.
+static tss__hd tss__hd_atan2(tss__hd y, tss__hd x) {
+    double l = sqrt(x.v * x.v + y.v * y.v), c = x.v / l, s = y.v / l;
+    tss__hd up = tss__hd_sub(tss__hd_scale(c, y), tss__hd_scale(s, x));
+    tss__hd along = tss__hd_add(tss__hd_scale(c, x), tss__hd_scale(s, y));
+    tss__hd t = tss__hd_mul(up, tss__hd_inverse(along));
+    t.v = atan2(y.v, x.v);
+    return t;
+}
+
+// A triangle: vol Ψ(F) of three nodes, F 3 × 2. With δ = FᵀF − I, n = F_0 × F_1 and J = |n|, as in
+// the plane,
+//     Ψ = μ/2 (j² − det δ) + λ'/2 j²,   j = J − 1 = (tr + det)(δ) / (1 + J),
+//     Ψ' = μ F + (λ' j − μ) J',   J' = (F_1 × n, n × F_0) / J.
+// J' is taken as 0 where a triangle has no area. Its gradient goes to g.
+static double tss__shell_cell(const double *Dinv, double vol, double mu, double la,
+                              const tss__hd *x, tss__hd *g) {
+    tss__hd F[2][3], n[3], D[2][3], one = tss__hd_of(1);
+    for (int r = 0; r < 3; r++) {
+        tss__hd e = tss__hd_sub(x[3 + r], x[r]), f = tss__hd_sub(x[6 + r], x[r]);
+        for (int m = 0; m < 2; m++)
+            F[m][r] = tss__hd_add(tss__hd_scale(Dinv[m], e), tss__hd_scale(Dinv[2 + m], f));
+    }
+    tss__hd xx = tss__hd_sub(tss__hd_dot(F[0], F[0]), one), xy = tss__hd_dot(F[0], F[1]);
+    tss__hd yy = tss__hd_sub(tss__hd_dot(F[1], F[1]), one);
+    tss__hd det = tss__hd_sub(tss__hd_mul(xx, yy), tss__hd_mul(xy, xy));
+    tss__hd more = tss__hd_add(tss__hd_add(xx, yy), det), J = tss__hd_of(0), inverse = J;
+    tss__hd_cross(F[0], F[1], n);
+    tss__hd square = tss__hd_dot(n, n);
+    if (square.v > 1e-24) J = tss__hd_sqrt(square), inverse = tss__hd_inverse(J);
+    tss__hd j = tss__hd_mul(more, tss__hd_inverse(tss__hd_add(one, J)));
+    tss__hd s = tss__hd_mul(tss__hd_sub(tss__hd_scale(la, j), tss__hd_of(mu)), inverse);
+    tss__hd_cross(F[1], n, D[0]), tss__hd_cross(n, F[0], D[1]);
+    for (int r = 0; r < 3; r++) {
+        tss__hd P[2];
+        for (int m = 0; m < 2; m++)
+            P[m] = tss__hd_add(tss__hd_scale(mu, F[m][r]), tss__hd_mul(s, D[m][r]));
+        for (int i = 0; i < 2; i++)
+            g[3 * (i + 1) + r] =
+                tss__hd_scale(vol, tss__hd_add(tss__hd_scale(Dinv[2 * i], P[0]),
+                                               tss__hd_scale(Dinv[2 * i + 1], P[1])));
+        g[r] = tss__hd_scale(-1, tss__hd_add(g[3 + r], g[6 + r]));
+    }
+    return 0.5 * vol * (mu * (j.v * j.v - det.v) + la * j.v * j.v);
+}
+
+// A hinge: w (θ − rest)² of nodes 0, 1 (its edge) and 2, 3 (across), θ the angle between the
+// normals, 0 when flat; ∂θ as in Bridson, Marino and Fedkiw 2003. *angle (NULL: not wanted): θ.
+// Beside a triangle without area it is 0.
+static double tss__shell_hinge(double w, double rest, const tss__hd *x, tss__hd *g, double *angle) {
+    tss__hd e[3], a[4][3], N[2][3], across[3];  // a: nodes 2 and 3 seen from 0, then from 1
+    for (int i = 0; i < 12; i++) g[i] = tss__hd_of(0);
+    for (int r = 0; r < 3; r++) {
+        e[r] = tss__hd_sub(x[3 + r], x[r]);
+        for (int k = 0; k < 4; k++)
+            a[k][r] = tss__hd_sub(x[6 + 3 * (k & 1) + r], x[3 * (k >> 1) + r]);
+    }
+    tss__hd_cross(a[0], a[2], N[0]), tss__hd_cross(a[3], a[1], N[1]);
+    tss__hd E = tss__hd_dot(e, e), n[2] = {tss__hd_dot(N[0], N[0]), tss__hd_dot(N[1], N[1])};
+    if (angle) *angle = 0;
+    if (!(E.v > 0 && n[0].v > 0 && n[1].v > 0)) return 0;
+    tss__hd l = tss__hd_sqrt(E), unit = tss__hd_inverse(l);
+    tss__hd_cross(N[1], N[0], across);
+    tss__hd theta =
+        tss__hd_atan2(tss__hd_mul(tss__hd_dot(across, e), unit), tss__hd_dot(N[0], N[1]));
+    if (angle) *angle = theta.v;
+    tss__hd gap = tss__hd_sub(theta, tss__hd_of(rest)), f = tss__hd_scale(2 * w, gap);
+    for (int k = 0; k < 2; k++) {  // shares of the two normals
+        tss__hd q = tss__hd_mul(f, tss__hd_inverse(n[k])), from_e = tss__hd_mul(q, unit);
+        tss__hd far = tss__hd_mul(q, l);
+        tss__hd from0 = tss__hd_mul(tss__hd_dot(a[2 + k], e), from_e);
+        tss__hd from1 = tss__hd_mul(tss__hd_dot(a[k], e), from_e);
+        for (int r = 0; r < 3; r++) {
+            g[6 + 3 * k + r] = tss__hd_mul(far, N[k][r]);
+            g[r] = tss__hd_add(g[r], tss__hd_mul(from0, N[k][r]));
+            g[3 + r] = tss__hd_sub(g[3 + r], tss__hd_mul(from1, N[k][r]));
+        }
+    }
+    return w * gap.v * gap.v;
+}
+
+// Stencil k: a cell, or the hinge k − cells. Columns of 3·nodes numbers: x, A and B (NULL: 0).
+static double tss__shell_stencil(const tss_elements *e, int k, const double *x, const double *A,
+                                 const double *B, tss__hd *g) {
+    tss__hd p[12];
+    int hinge = k - e->cells;
+    for (int i = 0; i < (hinge < 0 ? 9 : 12); i++) {
+        p[i] = tss__hd_of(x[i]);
+        if (A) p[i].a = A[i];
+        if (B) p[i].b = B[i];
+    }
+    if (hinge < 0) return tss__shell_cell(e->Dinv + 4 * k, e->vol[k], e->mu[k], e->la[k], p, g);
+    return tss__shell_hinge(e->hinge_weight[2 * hinge] + e->hinge_weight[2 * hinge + 1],
+                            e->rest[hinge], p, g, NULL);
+}
+
+static const int *tss__shell_nodes(const tss_elements *e, const int *cell, const int *hinge, int k,
+                                   int *count) {
+    *count = k < e->cells ? 3 : 4;
+    return k < e->cells ? cell + 3 * k : hinge + 4 * (k - e->cells);
+}
+
+static void tss__shell_gather(const double *x, const int *v, int count, double *to) {
+    for (int i = 0; i < count; i++)
+        for (int r = 0; r < 3; r++) to[3 * i + r] = x[3 * v[i] + r];
+}
+
+static double tss__shell_run(const tss_elements *e, const int *cell, const int *hinge,
+                             const double *x, double *g) {
+    double P = 0;
+    for (int k = 0; k < e->cells + e->hinges; k++) {
+        double at[12];
+        tss__hd G[12];
+        int count;
+        const int *v = tss__shell_nodes(e, cell, hinge, k, &count);
+        tss__shell_gather(x, v, count, at);
+        P += tss__shell_stencil(e, k, at, NULL, NULL, G);
+        for (int i = 0; g && i < 3 * count; i++) g[3 * v[i / 3] + i % 3] += G[i].v;
+    }
+    return P;
+}
+
+// ---- hinges of a shell ----------------------------------------------------------------------
+
+typedef struct tss__n_edge {
+    int lo, hi, cell, across;
+} tss__n_edge;
+
+static int tss__edge_order(const void *a, const void *b) {
+    const tss__n_edge *p = (const tss__n_edge *)a, *q = (const tss__n_edge *)b;
+    if (p->lo != q->lo) return p->lo < q->lo ? -1 : 1;
+    if (p->hi != q->hi) return p->hi < q->hi ? -1 : 1;
+    return p->cell < q->cell ? -1 : p->cell > q->cell;
+}
+
+// D⁻¹ (2 × 2) of a triangle in axes of its own, the first along its first edge; returns its area.
+static double tss__shell_rest(const double *X, const int *v, double *Dinv) {
+    double e[3], f[3], ef = 0, l = 0, area = 0;
+    for (int r = 0; r < 3; r++) {
+        e[r] = X[v[1] * 3 + r] - X[v[0] * 3 + r], f[r] = X[v[2] * 3 + r] - X[v[0] * 3 + r];
+        l += e[r] * e[r], ef += e[r] * f[r];
+    }
+    for (int r = 0; r < 3; r++) {
+        double n = e[(r + 1) % 3] * f[(r + 2) % 3] - e[(r + 2) % 3] * f[(r + 1) % 3];
+        area += n * n;
+    }
+    l = sqrt(l), area = sqrt(area);
+    // D = [l, ef/l; 0, area/l].
+    Dinv[0] = 1 / l, Dinv[1] = -ef / (l * area), Dinv[2] = 0, Dinv[3] = l / area;
+    return 0.5 * area;
+}
+
+// Sorts the edges of all cells. −1: an edge has more than two cells; else the hinges whose two
+// cells are not both out of the subset (place < 0).
+static int tss__shell_edges(const tss_elements_def *d, const int *place, tss__n_edge *edge) {
+    int count = 0, all = 3 * d->cells;
+    for (int k = 0; k < all; k++) {
+        const int *v = d->cell + k / 3 * 3;
+        int a = v[k % 3], b = v[(k + 1) % 3];
+        tss__n_edge e = {a < b ? a : b, a < b ? b : a, k / 3, v[(k + 2) % 3]};
+        edge[k] = e;
+    }
+    qsort(edge, (size_t)all, sizeof *edge, tss__edge_order);
+    for (int k = 0; k + 1 < all; k++) {
+        if (edge[k].lo != edge[k + 1].lo || edge[k].hi != edge[k + 1].hi) continue;
+        if (k + 2 < all && edge[k].lo == edge[k + 2].lo && edge[k].hi == edge[k + 2].hi) return -1;
+        count += place[edge[k].cell] >= 0 || place[edge[k + 1].cell] >= 0;
+    }
+    return count;
+}
+
+static void tss__shell_fill(tss_elements *e, const tss_elements_def *d, const int *place,
+                            const tss__n_edge *edge) {
+    int at = 0;
+    for (int i = 0; i < 3 * e->cells; i++) e->cell_hinge[i] = -1;
+    for (int k = 0; k + 1 < 3 * d->cells; k++) {
+        if (edge[k].lo != edge[k + 1].lo || edge[k].hi != edge[k + 1].hi) continue;
+        const tss__n_edge pair[2] = {edge[k], edge[k + 1]};
+        if (place[pair[0].cell] < 0 && place[pair[1].cell] < 0) continue;
+        int *v = e->hinge + 4 * at;
+        double x[12], Dinv[4], area = 0, l = 0;
+        tss__hd p[12], g[12];
+        v[0] = pair[0].lo, v[1] = pair[0].hi, v[2] = pair[0].across, v[3] = pair[1].across;
+        tss__shell_gather(d->X, v, 4, x);
+        for (int i = 0; i < 12; i++) p[i] = tss__hd_of(x[i]);
+        tss__shell_hinge(0, 0, p, g, &e->rest[at]);
+        for (int r = 0; r < 3; r++) l += (x[3 + r] - x[r]) * (x[3 + r] - x[r]);
+        for (int c = 0; c < 2; c++) area += tss__shell_rest(d->X, d->cell + 3 * pair[c].cell, Dinv);
+        for (int c = 0; c < 2; c++) {
+            int in = place[pair[c].cell], slot = 0;
+            double w = in < 0 ? 0 : d->weight ? d->weight[in] : 1;
+            e->hinge_weight[2 * at + c] = 0.5 * w * d->bending * 3 * l / area;
+            if (in < 0) continue;
+            while (e->cell_hinge[3 * in + slot] >= 0) slot++;
+            e->cell_hinge[3 * in + slot] = 2 * at + c;
+        }
+        at++;
+    }
+}
+
+static tss_result tss__shell_hinges(tss_elements *e, const tss_elements_def *d,
+                                    const char **wrong) {
+    size_t cells = (size_t)d->cells, bytes = cells * (3 * sizeof(tss__n_edge) + sizeof(int));
+    tss__n_edge *edge = (tss__n_edge *)tss_alloc(&e->host, bytes);
+    if (!edge) return TSS_ERROR_NO_MEMORY;
+    int *place = (int *)(void *)(edge + 3 * cells);
+    for (int k = 0; k < d->cells; k++) place[k] = d->subset ? -1 : k;
+    for (int k = 0; d->subset && k < d->count; k++) place[d->subset[k]] = k;
+    tss_result r = TSS_OK;
+    double Dinv[4];
+    for (int k = 0; k < d->cells; k++)
+        if (!(tss__shell_rest(d->X, d->cell + 3 * k, Dinv) > 0)) r = TSS_ERROR_BAD_MESH;
+    int count = tss__shell_edges(d, place, edge);
+    size_t h = (size_t)(count > 0 ? count : 0), m = 3 * (size_t)e->cells;
+    if (count < 0 && r == TSS_OK)
+        r = TSS_ERROR_BAD_MESH, *wrong = "elements: more than two triangles share an edge";
+    if (r == TSS_OK && count > 0) {
+        e->hinge_bytes = 3 * h * sizeof(double) + (8 * h + m) * sizeof(int);
+        e->rest = (double *)tss_alloc(&e->host, e->hinge_bytes);
+        if (!e->rest) r = TSS_ERROR_NO_MEMORY;
+    }
+    if (r == TSS_OK && count > 0) {
+        e->hinges = count, e->hinge_weight = e->rest + h;
+        e->hinge = (int *)(void *)(e->hinge_weight + 2 * h), e->hinge_local = e->hinge + 4 * h;
+        e->cell_hinge = e->hinge_local + 4 * h;
+        tss__shell_fill(e, d, place, edge);
+    }
+    tss_free(&e->host, edge, bytes);
+    return r;
+}
+
 static tss_result tss__elements_fill(tss_elements *e, const tss_elements_def *d, int *number) {
-    int dim = e->dim, v = dim + 1;
+    int dim = e->dim, v = e->per;
     for (int i = 0; i < d->nodes; i++) number[i] = -1;
+    for (int i = 0; i < 4 * e->hinges; i++) number[e->hinge[i]] = 0;
     for (int k = 0; k < e->cells; k++) {
         int at = d->subset ? d->subset[k] : k;
-        double mu, la, vol = tss__cell_rest(dim, d->X, d->cell + at * v, e->Dinv + k * dim * dim);
+        double mu, la, vol;
+        if (e->thick > 0)
+            vol = e->thick * tss__shell_rest(d->X, d->cell + at * v, e->Dinv + k * 4);
+        else
+            vol = tss__cell_rest(dim, d->X, d->cell + at * v, e->Dinv + k * dim * dim);
         if (!(vol > 0 && vol < 1e300)) return TSS_ERROR_BAD_MESH;
         tss_lame(d->E, d->nu, &mu, &la);
         if (d->mu) mu = d->mu[at], la = d->lambda[at];
@@ -1446,6 +1849,7 @@ static tss_result tss__elements_fill(tss_elements *e, const tss_elements_def *d,
         number[i] = e->used++;
     }
     for (int i = 0; i < e->cells * v; i++) e->local[i] = number[e->cell[i]];
+    for (int i = 0; i < 4 * e->hinges; i++) e->hinge_local[i] = number[e->hinge[i]];
     return TSS_OK;
 }
 
@@ -1453,6 +1857,7 @@ void tss_elements_destroy(tss_elements *e) {
     if (!e) return;
     tss_host h = e->host;
     tss_free(&h, e->p, e->bytes);
+    tss_free(&h, e->rest, e->hinge_bytes);
     tss_free(&h, e, sizeof *e);
 }
 
@@ -1460,9 +1865,11 @@ static tss_elements *tss__elements_alloc(const tss_host *h, const tss_elements_d
     tss_elements *e = (tss_elements *)tss_alloc(h, sizeof *e);
     if (!e) return NULL;
     memset(e, 0, sizeof *e);
-    e->host = *h, e->dim = d->dim, e->nodes = d->nodes, e->cells = d->subset ? d->count : d->cells;
+    e->host = *h, e->dim = d->dim, e->per = d->shell > 0 ? 3 : d->dim + 1, e->thick = d->shell,
+    e->nodes = d->nodes, e->cells = d->subset ? d->count : d->cells;
     size_t m = (size_t)e->cells, dim = (size_t)d->dim, most = (size_t)d->nodes;
-    if (m * (dim + 1) < most) most = m * (dim + 1);  // nodes that can be used
+    if (m * (dim + 1) < most && !(d->shell > 0))  // nodes that can be used
+        most = m * (dim + 1);
     e->bytes =
         m * (dim * dim + 3) * sizeof(double) + (2 * m * (dim + 1) + most * dim) * sizeof(int);
     e->p = tss_alloc(h, e->bytes);
@@ -1492,11 +1899,13 @@ tss_result tss_elements_create(const tss_host *host, const tss_elements_def *d,
         tss_elements_destroy(e);
         return TSS_ERROR_NO_MEMORY;
     }
-    r = tss__elements_fill(e, d, number);
+    wrong = "elements: a cell is flat or inverted";
+    r = d->shell > 0 && d->bending > 0 ? tss__shell_hinges(e, d, &wrong) : TSS_OK;
+    if (r == TSS_OK) r = tss__elements_fill(e, d, number);
     tss_free(&h, number, bytes);
     if (r != TSS_OK) {
         tss_elements_destroy(e);
-        return tss__n_refuse(&h, r, "elements: a cell is flat or inverted");
+        return r == TSS_ERROR_BAD_MESH ? tss__n_refuse(&h, r, wrong) : r;
     }
     *out = e;
     return TSS_OK;
@@ -1508,7 +1917,7 @@ enum { TSS__CELL_VALUE, TSS__CELL_REVERSE, TSS__CELL_TANGENT };
 
 typedef struct tss__n_jet {  // one sample; rows of x: base, k, second
     const tss_elements *e;
-    const int *cell;  // e->cell or e->local: how rows are numbered
+    const int *cell, *hinge;  // of e, or numbered as the rows are
     int mode, k, second;
     const double *x;
     size_t ld;        // from row to row
@@ -1517,7 +1926,7 @@ typedef struct tss__n_jet {  // one sample; rows of x: base, k, second
     const double *beta;  // k, or NULL: 0
     double *bar;         // rows as x, added to; NULL: VALUE
     double P, P2, *P1;   // P1: k, or NULL
-    double *scratch;     // (3 cols + 2)·9
+    double *scratch;     // (3 cols + 2)·TSS__N_CELL
 } tss__n_jet;
 
 static void tss__jet_gather(const tss__n_jet *t, int k, int cols, double *F) {
@@ -1599,11 +2008,71 @@ static void tss__jet_tangent(const tss__n_jet *t, const tss__n_cell *q, const do
     }
 }
 
+// x̂_a = Σ_b C_ab x_b, and Σ β_a x_a + γ x_2.
+static void tss__shell_mix(const tss__n_jet *t, const double *x, double *hat, double *mix) {
+    tss__n_zero(mix, 12), tss__n_zero(hat, 12 * (size_t)t->k);
+    for (int a = 0; a < t->k; a++)
+        for (int i = 0; i < 12; i++) {
+            mix[i] += t->beta ? t->beta[a] * x[12 * (a + 1) + i] : 0;
+            for (int b = 0; t->second && b < t->k; b++)
+                hat[12 * a + i] += t->C[a * t->k + b] * x[12 * (b + 1) + i];
+        }
+    for (int i = 0; t->second && i < 12; i++) mix[i] += t->gamma * x[12 * (t->k + 1) + i];
+}
+
+// What tss__jet_run does, of one stencil; m numbers a column.
+static void tss__shell_jet(tss__n_jet *t, int s, int m, const double *x, double *hat, double *bar) {
+    tss__hd g[12];
+    double mix[12];
+    int k = t->k, tangent = t->mode == TSS__CELL_TANGENT;
+    tss__shell_mix(t, x, hat, mix);
+    t->P += tss__shell_stencil(t->e, s, x, mix, NULL, g);
+    for (int i = 0; i < m; i++) {
+        for (int a = 0; a < k; a++) {
+            if (t->P1) t->P1[a] += g[i].v * x[12 * (a + 1) + i];
+            bar[12 * (a + 1) + i] = t->beta ? t->beta[a] * g[i].v : 0;
+        }
+        if (t->second)
+            t->P2 += g[i].v * x[12 * (k + 1) + i], bar[12 * (k + 1) + i] = t->gamma * g[i].v;
+        bar[i] = tangent ? g[i].v : t->alpha * g[i].v + g[i].a;
+    }
+    for (int a = 0; a < k && (t->second || tangent); a++) {
+        tss__shell_stencil(t->e, s, x, x + 12 * (a + 1), t->second ? hat + 12 * a : NULL, g);
+        for (int i = 0; i < m; i++) {
+            if (tangent) {
+                bar[12 * (a + 1) + i] = g[i].a;
+                continue;
+            }
+            t->P2 += g[i].a * hat[12 * a + i];
+            bar[12 * (a + 1) + i] += 2 * t->gamma * g[i].b;
+            bar[i] += t->gamma * g[i].ab;
+        }
+    }
+}
+
+static void tss__shell_jets(tss__n_jet *t) {
+    int cols = 1 + t->k + t->second, count;
+    double *x = t->scratch, *hat = x + 12 * cols, *bar = hat + 12 * (t->k + 1);
+    for (int s = 0; s < t->e->cells + t->e->hinges; s++) {
+        const int *v = tss__shell_nodes(t->e, t->cell, t->hinge, s, &count);
+        for (int c = 0; c < cols; c++)
+            tss__shell_gather(t->x + (size_t)c * t->ld, v, count, x + 12 * c);
+        tss__shell_jet(t, s, 3 * count, x, hat, bar);
+        for (int c = 0; t->mode != TSS__CELL_VALUE && c < cols; c++)
+            for (int i = 0; i < 3 * count; i++)
+                t->bar[(size_t)c * t->ld + (size_t)(3 * v[i / 3] + i % 3)] += bar[12 * c + i];
+    }
+}
+
 static void tss__jet_run(tss__n_jet *t) {
     int cols = 1 + t->k + t->second, d = t->e->dim;
     double *F = t->scratch, *hat = F + 9 * cols, *bar = hat + 9 * (t->k + 1);
     t->P = t->P2 = 0;
     if (t->P1) tss__n_zero(t->P1, (size_t)t->k);
+    if (t->e->thick > 0) {
+        tss__shell_jets(t);
+        return;
+    }
     for (int k = 0; k < t->e->cells; k++) {
         tss__n_cell q;
         double vol = t->e->vol[k];
@@ -1622,30 +2091,143 @@ static void tss__jet_run(tss__n_jet *t) {
     }
 }
 
+// ---- the gradient alone, eight cells at a time ------------------------------------------------
+
+// Ψ and w·vol·P of eight cells from F; entry i of cell l at [i][l]. The same formulas as
+// tss__cell_at, in loops that a compiler turns into vector instructions.
+typedef struct tss__n_lanes {
+    double F[9][8], Dinv[9][8], mu[8], la[8], vol[8], psi[8];
+} tss__n_lanes;
+
+static void tss__lanes3(tss__n_lanes *q) {
+    for (int l = 0; l < 8; l++) {
+        double a = q->F[0][l], b = q->F[1][l], c = q->F[2][l], d = q->F[3][l], e = q->F[4][l],
+               f = q->F[5][l], g = q->F[6][l], h = q->F[7][l], i = q->F[8][l];
+        double mu = q->mu[l], la = q->la[l], A = a - 1, E = e - 1, I = i - 1;
+        double K0 = e * i - f * h, K1 = f * g - d * i, K2 = d * h - e * g;
+        double K3 = c * h - b * i, K4 = a * i - c * g, K5 = b * g - a * h;
+        double K6 = b * f - c * e, K7 = c * d - a * f, K8 = a * e - b * d;
+        double two = A * E - b * d + A * I - c * g + E * I - f * h;
+        double three = A * (E * I - f * h) - b * (d * I - f * g) + c * (d * h - E * g);
+        double j0 = A + E + I + two + three;
+        double gap0 = A * A + b * b + c * c + d * d + E * E + f * f + g * g + h * h + I * I -
+                      2 * two - 2 * three;
+        double xx = 2 * A + (A * A + d * d + g * g), yy = 2 * E + (b * b + E * E + h * h);
+        double zz = 2 * I + (c * c + f * f + I * I), xy = b + d + (A * b + d * E + g * h);
+        double xz = c + g + (A * c + d * f + g * I), yz = f + h + (b * c + E * f + h * I);
+        double size = xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz);
+        two = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz;
+        three = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz);
+        int small = size <= TSS__N_SMALL && j0 > -1;
+        double j1 = (xx + yy + zz + two + three) / (small ? 2 + j0 : 1);
+        double j = small ? j1 : j0, gap = small ? j1 * j1 - two - three : gap0;
+        double s = la * j - mu;
+        q->psi[l] = 0.5 * (mu * gap + la * j * j);
+        q->F[0][l] = mu * a + s * K0, q->F[1][l] = mu * b + s * K1, q->F[2][l] = mu * c + s * K2;
+        q->F[3][l] = mu * d + s * K3, q->F[4][l] = mu * e + s * K4, q->F[5][l] = mu * f + s * K5;
+        q->F[6][l] = mu * g + s * K6, q->F[7][l] = mu * h + s * K7, q->F[8][l] = mu * i + s * K8;
+    }
+}
+
+static void tss__lanes2(tss__n_lanes *q) {
+    for (int l = 0; l < 8; l++) {
+        double a = q->F[0][l], b = q->F[1][l], c = q->F[2][l], d = q->F[3][l];
+        double mu = q->mu[l], la = q->la[l], A = a - 1, D = d - 1, two = A * D - b * c;
+        double j0 = A + D + two, gap0 = A * A + b * b + c * c + D * D - 2 * two;
+        double xx = 2 * A + (A * A + c * c), yy = 2 * D + (b * b + D * D);
+        double xy = b + c + (A * b + c * D);
+        int small = xx * xx + yy * yy + 2 * xy * xy <= TSS__N_SMALL && j0 > -1;
+        two = xx * yy - xy * xy;
+        double j1 = (xx + yy + two) / (small ? 2 + j0 : 1);
+        double j = small ? j1 : j0, gap = small ? j1 * j1 - two : gap0, s = la * j - mu;
+        q->psi[l] = 0.5 * (mu * gap + la * j * j);
+        q->F[0][l] = mu * a + s * d, q->F[1][l] = mu * b - s * c;
+        q->F[2][l] = mu * c - s * b, q->F[3][l] = mu * d + s * a;
+    }
+}
+
+// F of `count` <= 8 cells from cell k on; the other lanes are at rest. D and G below are 2 or 3 and
+// known when this is compiled.
+static inline void tss__lanes_gather(const tss_elements *e, const int *cell, int k, int count,
+                                     const double *x, const int d, tss__n_lanes *q) {
+    double edge[9][8];
+    for (int l = 0; l < 8; l++) {
+        int at = l < count ? k + l : k;
+        const int *v = cell + at * (d + 1);
+        const double *Dinv = e->Dinv + at * d * d;
+        for (int r = 0; r < d; r++)
+            for (int i = 0; i < d; i++) edge[r * d + i][l] = x[v[i + 1] * d + r] - x[v[0] * d + r];
+        for (int i = 0; i < d * d; i++) q->Dinv[i][l] = Dinv[i];
+        q->mu[l] = e->mu[at], q->la[l] = e->la[at], q->vol[l] = l < count ? e->vol[at] : 0;
+    }
+    for (int r = 0; r < d; r++)
+        for (int m = 0; m < d; m++)
+            for (int l = 0; l < 8; l++) {
+                double s = 0;
+                for (int i = 0; i < d; i++) s += edge[r * d + i][l] * q->Dinv[i * d + m][l];
+                q->F[r * d + m][l] = s;
+            }
+}
+
+static inline void tss__lanes_scatter(const int *cell, int k, int count, const int d,
+                                      const tss__n_lanes *q, double *g) {
+    double f[9][8];
+    for (int r = 0; r < d; r++)
+        for (int i = 0; i < d; i++)
+            for (int l = 0; l < 8; l++) {
+                double s = 0;
+                for (int m = 0; m < d; m++) s += q->F[r * d + m][l] * q->Dinv[i * d + m][l];
+                f[r * d + i][l] = q->vol[l] * s;
+            }
+    for (int l = 0; l < count; l++) {
+        const int *v = cell + (k + l) * (d + 1);
+        for (int r = 0; r < d; r++)
+            for (int i = 0; i < d; i++)
+                g[v[i + 1] * d + r] += f[r * d + i][l], g[v[0] * d + r] -= f[r * d + i][l];
+    }
+}
+
+static double tss__lanes_run(const tss_elements *e, const int *cell, const double *x, double *g) {
+    double P = 0;
+    for (int k = 0; k < e->cells; k += 8) {
+        tss__n_lanes q;
+        int count = e->cells - k < 8 ? e->cells - k : 8;
+        if (e->dim == 3)
+            tss__lanes_gather(e, cell, k, count, x, 3, &q), tss__lanes3(&q);
+        else
+            tss__lanes_gather(e, cell, k, count, x, 2, &q), tss__lanes2(&q);
+        for (int l = 0; l < count; l++) P += q.vol[l] * q.psi[l];
+        if (g && e->dim == 3) tss__lanes_scatter(cell, k, count, 3, &q, g);
+        if (g && e->dim == 2) tss__lanes_scatter(cell, k, count, 2, &q, g);
+    }
+    return P;
+}
+
+// P at x; its gradient is added to g (NULL: not wanted). Nodes are numbered as in cell and hinge.
+static double tss__elements_gradient(const tss_elements *e, const int *cell, const int *hinge,
+                                     const double *x, double *g) {
+    return e->thick > 0 ? tss__shell_run(e, cell, hinge, x, g) : tss__lanes_run(e, cell, x, g);
+}
+
 double tss_elements_potential(const tss_elements *e, const double *x, double *g) {
-    double scratch[5 * 9];
-    tss__n_jet t;
-    memset(&t, 0, sizeof t);
-    t.e = e, t.cell = e->cell, t.mode = g ? TSS__CELL_REVERSE : TSS__CELL_VALUE;
-    t.x = x, t.alpha = 1, t.bar = g, t.scratch = scratch;
-    tss__jet_run(&t);
-    return t.P;
+    return tss__elements_gradient(e, e->cell, e->hinge, x, g);
 }
 
 tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, const double *x1,
                              const double *C, const double *x2, double *P, double *P1, double *P2,
                              double alpha, const double *beta, double gamma, double *x_bar,
                              double *x1_bar, double *x2_bar) {
-    if (k < 0 || (k > 0 && !x1) || !C != !x2 || (C && k == 0)) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(1, k) || (k > 0 && !x1) || !C != !x2 || (C && k == 0))
+        return TSS_ERROR_BAD_ARGUMENT;
     size_t n = (size_t)(e->nodes * e->dim), wide = n * sizeof(double), K = (size_t)k;
-    size_t cols = 1 + K + (C != NULL), count = 2 * cols * n + 9 * (3 * cols + 2);
+    size_t cols = 1 + K + (C != NULL), count = 2 * cols * n + TSS__N_CELL * (3 * cols + 2);
     double *p = (double *)tss_alloc(&e->host, count * sizeof(double));
     if (!p) return TSS_ERROR_NO_MEMORY;
     tss__n_zero(p, count);
     tss__n_jet t;
     memset(&t, 0, sizeof t);
-    t.e = e, t.cell = e->cell, t.mode = TSS__CELL_REVERSE, t.k = k, t.second = C != NULL, t.x = p,
-    t.ld = n;
+    t.e = e, t.cell = e->cell, t.hinge = e->hinge, t.mode = TSS__CELL_REVERSE, t.k = k,
+    t.second = C != NULL, t.x = p, t.ld = n;
     t.C = C, t.alpha = alpha, t.beta = beta, t.gamma = gamma, t.bar = p + cols * n, t.P1 = P1;
     t.scratch = t.bar + cols * n;
     memcpy(p, x, wide);
@@ -1699,7 +2281,7 @@ static void tss__reduced_plan(tss__n_reduced *j, tss__n_slab *s, int theta) {
     int reverse = j->mode != TSS__CELL_VALUE;
     tss__jetpass_plan(&j->p, s,
                       TSS__PASS_X | (reverse ? TSS__PASS_XBAR : 0) | (theta ? TSS__PASS_THETA : 0));
-    j->cell_scratch = tss__n_take(s, j->p.chunks, (size_t)(3 * j->p.cols + 2) * 9);
+    j->cell_scratch = tss__n_take(s, j->p.chunks, (size_t)(3 * j->p.cols + 2) * TSS__N_CELL);
     j->betas = tss__n_take(s, 1, (size_t)j->p.k);
 }
 
@@ -1713,11 +2295,12 @@ static void tss__reduced_elements(tss__n_reduced *j, int c) {
         tss__n_jet t;
         memset(&t, 0, sizeof t);
         t.e = j->e, t.cell = p->dof ? j->e->local : j->e->cell, t.mode = j->mode, t.k = p->k;
+        t.hinge = p->dof ? j->e->hinge_local : j->e->hinge;
         t.second = p->second, t.x = p->x + row, t.ld = p->coords;
         t.C = p->second ? p->C + (size_t)i * (size_t)(p->k * p->k) : NULL;
         t.alpha = j->alpha ? j->alpha[i] : j->all_alpha, t.beta = j->betas, t.gamma = j->gamma;
         t.bar = j->mode != TSS__CELL_VALUE ? p->xbar + row : NULL;
-        t.scratch = j->cell_scratch + (size_t)c * (size_t)(3 * p->cols + 2) * 9;
+        t.scratch = j->cell_scratch + (size_t)c * (size_t)(3 * p->cols + 2) * TSS__N_CELL;
         tss__jet_run(&t);
         if (j->P) j->P[i] = t.P;
         if (j->P2) j->P2[i] = t.P2;
@@ -1756,7 +2339,8 @@ static void tss__n_identity(double *D, int r) {
 
 tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
                                  const double *z, double *P, double *gradient, double *hessian) {
-    if (batch < 1 || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(batch, hessian ? n->width[0] : 0) || !tss__n_fits(n, e))
+        return TSS_ERROR_BAD_ARGUMENT;
     tss__n_reduced j;
     tss__n_slab s = {NULL, 0, 0};
     int r = n->width[0], k = hessian ? r : 0;
@@ -1779,7 +2363,7 @@ tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_wo
 
 tss_result tss_reduced_second(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
                               const double *z, const double *u, const double *v, double *out) {
-    if (batch < 1 || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
+    if (!tss__n_sizes(batch, 2) || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
     tss__n_reduced j;
     tss__n_slab s = {NULL, 0, 0};
     size_t r = (size_t)n->width[0], B = (size_t)batch;
@@ -1845,7 +2429,8 @@ static void tss__recon_task(int c, int worker, void *arg) {
 tss_result tss_loss_reconstruction(const tss_net *dec, const tss_net *enc, tss_work *w,
                                    const double *mass, int batch, const double *x, double weight,
                                    double *loss, double *decoder_bar, double *encoder_bar) {
-    if (batch < 1 || dec->has_in || enc->outputs != dec->inputs || enc->inputs != dec->outputs)
+    if (!tss__n_sizes(batch, 0) || dec->has_in || enc->outputs != dec->inputs ||
+        enc->inputs != dec->outputs)
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_recon j;
     tss__n_slab s = {NULL, 0, 0};
@@ -1919,7 +2504,7 @@ tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_
                                  const double *mass, double lambda, double sigma, double eps,
                                  int batch, const double *z, double weight, double *loss,
                                  double *parts, double *decoder_bar) {
-    if (batch < 2 || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
+    if (batch < 2 || !tss__n_sizes(batch, 0) || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_unsup j;
     tss__n_slab s = {NULL, 0, 0};
@@ -2107,7 +2692,8 @@ static void tss__lip_reverse(tss__n_lip *l, tss_work *w) {
 static int tss__lip_valid(const tss_net *n, const tss_elements *e, const tss_lipschitz_def *d,
                           int batch, const double *probe) {
     int random = d->estimator != TSS_LIPSCHITZ_EXACT;
-    return batch >= 2 && tss__n_fits(n, e) && d->order >= 0 && d->order <= 2 &&
+    return batch >= 2 && tss__n_sizes(batch, d->order == 2 ? n->width[0] : 2) &&
+           tss__n_fits(n, e) && d->order >= 0 && d->order <= 2 &&
            (unsigned)d->estimator <= TSS_LIPSCHITZ_U && d->floor >= 0 && d->floor < 1e300 &&
            (!random || (d->order == 2 && probe && d->probes >= 1 && d->probes <= n->width[0]));
 }
@@ -2319,6 +2905,29 @@ typedef struct tss__cub_fill {  // one sample's rows of G
     double scale;
 } tss__cub_fill;
 
+// The reduced gradient of a shell's cell: its own, and half of its hinges'.
+static void tss__cub_fill_shell(const tss__cub_fill *f, int cell, double *to) {
+    const tss_elements *e = f->e;
+    for (int s = -1; s < (e->hinges ? 3 : 0); s++) {
+        int share = s < 0 ? -1 : e->cell_hinge[3 * cell + s], count;
+        if (s >= 0 && share < 0) continue;
+        double x[12];
+        tss__hd p[12], g[12];
+        const int *v =
+            tss__shell_nodes(e, e->cell, e->hinge, s < 0 ? cell : e->cells + share / 2, &count);
+        tss__shell_gather(f->x, v, count, x);
+        for (int i = 0; i < 3 * count; i++) p[i] = tss__hd_of(x[i]);
+        if (s < 0)
+            tss__shell_cell(e->Dinv + 4 * cell, e->vol[cell], e->mu[cell], e->la[cell], p, g);
+        else
+            tss__shell_hinge(e->hinge_weight[share], e->rest[share / 2], p, g, NULL);
+        for (int a = 0; a < f->r; a++) {
+            tss__shell_gather(f->x + (size_t)(a + 1) * f->n, v, count, x);
+            for (int i = 0; i < 3 * count; i++) to[a] += f->scale * g[i].v * x[i];
+        }
+    }
+}
+
 static void tss__cub_fill_task(int block, int worker, void *arg) {
     (void)worker;
     tss__cub_fill *f = (tss__cub_fill *)arg;
@@ -2331,6 +2940,11 @@ static void tss__cub_fill_task(int block, int worker, void *arg) {
         tss__n_jet t;
         memset(&t, 0, sizeof t);
         int cell = c->cell[k];
+        if (e->thick > 0) {
+            double *to = c->G + (size_t)k * c->m + f->first;
+            tss__n_zero(to, (size_t)f->r), tss__cub_fill_shell(f, cell, to);
+            continue;
+        }
         t.e = e, t.cell = e->cell, t.x = f->x, t.ld = f->n;
         tss__jet_gather(&t, cell, 1, F);
         tss__cell_at(&q, e->dim, e->mu[cell], e->la[cell], F);
@@ -2394,7 +3008,7 @@ tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work
                                int *subset, double *weight, int *count, double *error) {
     *count = 0;
     if (!tss__n_fits(n, e) || samples < 1 || def->count < 1 || def->candidates < 0 ||
-        !(def->tol >= 0) || (double)samples * n->inputs > 1e9)
+        !(def->tol >= 0) || !tss__n_sizes(samples, n->inputs) || (double)samples * n->inputs > 1e9)
         return TSS_ERROR_BAD_ARGUMENT;
     tss__cub c;
     tss__n_slab s = {NULL, 0, 0};
@@ -3037,23 +3651,53 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
 
 // ---------------------------------------------------------------------------------------------
 // >>reduced_solver (private)
+// With φ(z) the values that the decoder's last linear map takes (its last hidden layer, or the
+// MLP's output where the fixed matrix has fewer columns), f(z) = c + B φ. So
+//     ‖f − q̄‖²_M = (φ − φ̄)ᵀ G (φ − φ̄) − 2 w·(φ − φ̄) + const,   G = BᵀMB, φ̄ = 2φ_t − φ_{t−1},
+// and force·f is linear. Handles leave G (rank-one terms, when their nodes change) and make w: the
+// rows of nodes whose x_t or x_{t−1} were not on c + Bφ. Only the rows of B that elements and
+// contact touch are multiplied in an evaluation: `rows` of them, transposed and contiguous.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__REDUCED_COOKIE 0x726564
+#define TSS__REDUCED_DENSE 1024  // r up to which there is a Hessian
+
+typedef struct tss__n_held {  // nodes that are not where f puts them
+    int count, *node, *at;    // at: of each node of the mesh, 1 + its place in node; 0: not held
+    double *x;                // count × dim
+} tss__n_held;
 
 struct tss_reduced {
     tss_host host;
     tss_reduced_def def;
-    tss_work *work;
-    tss__n_reduced job;
-    int r, pairs, newest;  // pairs kept of the L-BFGS history
-    size_t n;
+    int r, dim, nodes, top;  // top: linear layers before φ
+    int k_most;              // directions of an evaluation: r or 0
+    int pairs, newest;       // of the L-BFGS history
+    size_t n, m, rows, panel_size;
     double *p;  // one block
     size_t bytes;
-    double *z, *z_last, *x, *x_last, *q, *force;           // state; x_last: x_{t−1}
+    int *ints;  // another
+    size_t int_bytes;
+    double *mass, *force, *c, *B, *G, *G_free;  // n, n, n, n × m, m × m twice
+    double *c_rows, *B_rows;                    // rows; m × rows
+    int *row_node;                              // rows / dim: nodes of the rows, ascending
+    int *cell, *hinge, *near, contacts;         // of the elements, and contact nodes, by row
+    double *near_weight;
+    double *z, *z_last, *phi, *phi_last, *x;  // state; x is decoded on demand
+    int *decoded;
+    tss__n_held held[3];  // from now on; at x_t; at x_{t−1}
+    unsigned *seen, stamp;
+    double *force_phi, force_c;  // Bᵀ force, force·c
+    // What an evaluation minimises: half·(the quadratic) + the rest, unless fit.
+    int fit;
+    double half, offset, constant;  // constant: of the quadratic; offset: of the forces
+    const double *quad;
+    double *phi_bar, *w, *u, *gap;
+    double *tape, *slope, *mid, *bar, *next, *X, *Xbar, *panel, *scratch;
     double *S, *Y, *curve, *part, *g, *g_new, *d, *z_new;  // S, Y: memory × r
-    double energy;
-    int evaluations, current;  // 1: the last evaluation was at z
+    double *H, *V, *lambda;                                // r × r twice, r
+    double energy, scale;
+    int evaluations, hessians;
     uint64_t exits[TSS_EXITS];
 };
 
@@ -3061,111 +3705,450 @@ tss_reduced_def tss_reduced_def_default(void) {
     tss_reduced_def d;
     memset(&d, 0, sizeof d);
     d.h = 0.05, d.eps = 1e-5, d.ftol = 2.2e-9, d.memory = 10, d.max_line = 128,
-    d.max_iterations = 1024;
+    d.max_iterations = 1024, d.shift = 1e-6;
     d.cookie = TSS__REDUCED_COOKIE;
     return d;
 }
 
 static const char *tss__reduced_complaint(const tss_reduced_def *d) {
-    if (!d->decoder || !d->elements || !tss__n_fits(d->decoder, d->elements))
-        return "reduced solver: decoder and elements do not fit each other";
     if (!(d->h >= 0 && d->h < 1e300)) return "reduced solver: h must be >= 0";
     if (d->h > 0 && !d->mass) return "reduced solver: dynamics need masses";
+    for (int i = 0; d->mass && i < d->decoder->outputs; i++)
+        if (!(d->mass[i] >= 0 && d->mass[i] < 1e300))
+            return "reduced solver: a mass is negative or not finite";
     if (!(d->eps >= 0) || !(d->ftol >= 0)) return "reduced solver: a tolerance is negative";
     if (d->memory < 1 || d->memory > 64 || d->max_line < 1 || d->max_iterations < 0)
         return "reduced solver: memory, max_line or max_iterations out of range";
+    if (d->decoder->inputs > (1 << 24)) return "reduced solver: more than 2^24 inputs";
+    if (d->solver != TSS_LBFGS && d->solver != TSS_PROJECTED_NEWTON)
+        return "reduced solver: unknown solver";
+    if (d->solver == TSS_PROJECTED_NEWTON && d->decoder->inputs > TSS__REDUCED_DENSE)
+        return "reduced solver: projected Newton takes at most 1024 inputs";
+    if (!(d->shift > 0 && d->shift < 1e300)) return "reduced solver: shift must be > 0";
+    return NULL;
+}
+
+static const char *tss__contact_complaint(const tss_reduced_def *d, int nodes) {
+    if (!d->sdf) return NULL;
+    int count = d->contact_node ? d->contact_count : nodes;
+    if (!(d->contact_stiffness >= 0 && d->contact_stiffness < 1e300) ||
+        !isfinite(d->contact_margin))
+        return "reduced solver: contact_stiffness or contact_margin out of range";
+    if (count < 0 || count > nodes) return "reduced solver: contact_count out of range";
+    for (int i = 0; d->contact_node && i < count; i++)
+        if (d->contact_node[i] < 0 || d->contact_node[i] >= nodes)
+            return "reduced solver: a contact node is out of range";
+    for (int i = 0; d->contact_weight && i < count; i++)
+        if (!(d->contact_weight[i] >= 0 && d->contact_weight[i] < 1e300))
+            return "reduced solver: a contact weight is negative or not finite";
     return NULL;
 }
 
 void tss_reduced_destroy(tss_reduced *s) {
     if (!s) return;
     tss_host h = s->host;
-    tss_work_destroy(s->work);
     tss_free(&h, s->p, s->bytes);
+    tss_free(&h, s->ints, s->int_bytes);
     tss_free(&h, s, sizeof *s);
 }
 
+// ---- memory ---------------------------------------------------------------------------------
+
+// The nodes whose rows an evaluation needs: held[0].at serves as their mark. Sets rows.
+static void tss__reduced_mark(tss_reduced *s) {
+    const tss_elements *e = s->def.elements;
+    int *mark = s->held[0].at;
+    for (int i = 0; e && i < e->used; i++) mark[e->dof[i * s->dim] / s->dim] = 1;
+    for (int i = 0; i < s->contacts; i++) mark[s->near[i]] = 1;
+    s->rows = 0;
+    for (int i = 0; i < s->nodes; i++) {
+        if (!mark[i]) continue;
+        s->row_node[s->rows] = i, mark[i] = (int)++s->rows;
+    }
+}
+
+// Numbers cells, hinges and contact nodes by rows, and takes the marks away.
+static void tss__reduced_number(tss_reduced *s) {
+    const tss_elements *e = s->def.elements;
+    int *mark = s->held[0].at;
+    for (int i = 0; e && i < e->cells * e->per; i++) s->cell[i] = mark[e->cell[i]] - 1;
+    for (int i = 0; e && i < 4 * e->hinges; i++) s->hinge[i] = mark[e->hinge[i]] - 1;
+    for (int i = 0; i < s->contacts; i++) s->near[i] = mark[s->near[i]] - 1;
+    memset(mark, 0, (size_t)s->nodes * sizeof(int));
+    s->rows *= (size_t)s->dim;
+}
+
+static int tss__reduced_ints(tss_reduced *s) {
+    const tss_elements *e = s->def.elements;
+    size_t nodes = (size_t)s->nodes, cells = e ? (size_t)e->cells * (size_t)e->per : 0;
+    size_t hinges = e ? 4 * (size_t)e->hinges : 0, near = (size_t)s->contacts;
+    size_t all = 8 * nodes + cells + hinges + near + 1;
+    s->int_bytes = all * sizeof(int);
+    s->ints = (int *)tss_alloc(&s->host, s->int_bytes);
+    if (!s->ints) return 0;
+    memset(s->ints, 0, s->int_bytes);
+    int *p = s->ints;
+    for (int k = 0; k < 3; k++) s->held[k].node = p, s->held[k].at = p + nodes, p += 2 * nodes;
+    s->seen = (unsigned *)(void *)p, s->row_node = p + nodes, p += 2 * nodes;
+    s->cell = p, s->hinge = p + cells, s->near = s->hinge + hinges, s->decoded = s->near + near;
+    for (int i = 0; i < s->contacts; i++)
+        s->near[i] = s->def.contact_node ? s->def.contact_node[i] : i;
+    tss__reduced_mark(s);
+    tss__reduced_number(s);
+    return 1;
+}
+
 static void tss__reduced_carve(tss_reduced *s, tss__n_slab *b) {
-    size_t r = (size_t)s->r, n = s->n;
-    double **small[6] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new};
-    double **large[4] = {&s->x, &s->x_last, &s->q, &s->force};
-    for (int k = 0; k < 6; k++) *small[k] = tss__n_take(b, 1, r);
-    for (int k = 0; k < 4; k++) *large[k] = tss__n_take(b, 1, n);
-    s->S = tss__n_take(b, s->def.memory, r), s->Y = tss__n_take(b, s->def.memory, r);
-    s->curve = tss__n_take(b, s->def.memory, 1), s->part = tss__n_take(b, s->def.memory, 1);
+    const tss_net *net = s->def.decoder;
+    size_t r = (size_t)s->r, n = s->n, m = s->m, M = (size_t)s->def.memory;
+    size_t cols = 1 + (size_t)s->k_most, H = s->k_most ? r : 0, tape = net->off[s->top + 1];
+    size_t x_cols = 1 + (s->def.solver == TSS_PROJECTED_NEWTON ? r : 0);
+    double **of_r[] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new, &s->lambda};
+    double **of_n[] = {&s->mass,      &s->force,     &s->c,        &s->x,
+                       &s->held[0].x, &s->held[1].x, &s->held[2].x};
+    double **of_m[] = {&s->phi, &s->phi_last, &s->phi_bar, &s->w, &s->u, &s->gap, &s->force_phi};
+    for (int k = 0; k < 7; k++) *of_r[k] = tss__n_take(b, 1, r);
+    for (int k = 0; k < 7; k++) *of_n[k] = tss__n_take(b, 1, n);
+    for (int k = 0; k < 7; k++) *of_m[k] = tss__n_take(b, 1, m);
+    s->S = tss__n_take(b, (double)M, r), s->Y = tss__n_take(b, (double)M, r);
+    s->curve = tss__n_take(b, 1, M), s->part = tss__n_take(b, 1, M);
+    s->H = tss__n_take(b, (double)H, H), s->V = tss__n_take(b, (double)H, H);
+    s->B = tss__n_take(b, (double)n, m), s->c_rows = tss__n_take(b, 1, s->rows);
+    s->G = tss__n_take(b, (double)m, m), s->G_free = tss__n_take(b, (double)m, m);
+    s->B_rows = tss__n_take(b, (double)m, s->rows);
+    s->near_weight = tss__n_take(b, 1, (size_t)s->contacts);
+    s->tape = tss__n_take(b, (double)cols, tape), s->mid = tss__n_take(b, (double)cols, tape);
+    s->slope = tss__n_take(b, 2, tape);
+    s->bar = tss__n_take(b, (double)cols, (size_t)net->widest);
+    s->next = tss__n_take(b, (double)cols, (size_t)net->widest);
+    s->X = tss__n_take(b, (double)x_cols, s->rows);
+    s->Xbar = tss__n_take(b, (double)x_cols, s->rows);
+    s->panel_size = s->rows > (size_t)net->widest ? s->rows : (size_t)net->widest;
+    if (cols > s->panel_size) s->panel_size = cols;
+    s->panel = tss__n_take(b, 8, s->panel_size);
+    s->scratch = tss__n_take(b, TSS__N_CELL, 3 * x_cols + 2);
 }
 
 static int tss__reduced_arrays(tss_reduced *s) {
-    tss__n_slab b = {NULL, 0, 0}, pass = {NULL, 0, 0};
+    tss__n_slab b = {NULL, 0, 0};
+    if (!tss__reduced_ints(s)) return 0;
     tss__reduced_carve(s, &b);
-    if (b.want >= 1e15 || tss_work_create(&s->host, &s->work) != TSS_OK) return 0;
+    if (b.want >= 1e15) return 0;
     s->bytes = b.used * sizeof(double);
     s->p = (double *)tss_alloc(&s->host, s->bytes);
     if (!s->p) return 0;
     tss__n_zero(s->p, b.used);
     b.base = s->p, b.used = 0;
     tss__reduced_carve(s, &b);
-    tss__reduced_init(&s->job, s->def.decoder, s->def.elements, TSS__CELL_REVERSE, 1, 0, NULL);
-    s->job.p.dof = NULL, s->job.p.coords = s->n;
-    tss__reduced_plan(&s->job, &pass, 0);
-    if (!tss__n_room(s->work, &pass)) return 0;
-    tss__reduced_plan(&s->job, &pass, 0);
     return 1;
+}
+
+// ---- the affine end of the decoder ----------------------------------------------------------
+
+// Sums with a fixed order that the compiler can keep in registers of eight.
+static double tss__n_dot8(size_t n, const double *a, const double *b) {
+    double acc[8] = {0}, s = 0;
+    size_t i = 0;
+    for (; i + 8 <= n; i += 8)
+        for (size_t c = 0; c < 8; c++) acc[c] += a[i + c] * b[i + c];
+    for (; i < n; i++) s += a[i] * b[i];
+    return s + (((acc[0] + acc[4]) + (acc[2] + acc[6])) + ((acc[1] + acc[5]) + (acc[3] + acc[7])));
+}
+
+static void tss__n_axpy(size_t n, double f, const double *x, double *y) {
+    for (size_t i = 0; i < n; i++) y[i] += f * x[i];
+}
+
+// y += Σ f_a x_a over `count` rows of x, four at a time: y is read and written less often.
+static void tss__n_combine(size_t n, size_t count, const double *f, const double *x, double *y) {
+    size_t a = 0;
+    for (; a + 4 <= count; a += 4) {
+        const double *p = x + a * n, *q = p + n, *r = q + n, *s = r + n;
+        double e = f[a], g = f[a + 1], h = f[a + 2], k = f[a + 3];
+        for (size_t i = 0; i < n; i++) y[i] += (e * p[i] + g * q[i]) + (h * r[i] + k * s[i]);
+    }
+    for (; a < count; a++) tss__n_axpy(n, f[a], x + a * n, y);
+}
+
+// c and B, row by row.
+static void tss__reduced_affine(tss_reduced *s) {
+    const tss_net *net = s->def.decoder;
+    size_t m = s->m, last = (size_t)net->width[net->layers];
+    const double *W = net->par + net->theta[net->layers - 1], *b = W + m * last;
+    for (size_t i = 0; i < s->n; i++) {
+        double *row = s->B + i * m, f = net->map == TSS__MAP_SCATTER ? net->scale : 1;
+        int from = net->map == TSS__MAP_SCATTER ? net->from[i] : (int)i;
+        s->c[i] = net->map ? net->out_base[i] : 0;
+        if (net->map == TSS__MAP_MATRIX && s->top == net->layers) {
+            memcpy(row, net->out_matrix + i * m, m * sizeof(double));
+        } else if (net->map == TSS__MAP_MATRIX) {
+            const double *out = net->out_matrix + i * last;
+            for (size_t k = 0; k < m; k++) row[k] = tss__n_dot8(last, W + k * last, out);
+            s->c[i] += tss__n_dot8(last, b, out);
+        } else if (from >= 0) {
+            for (size_t k = 0; k < m; k++) row[k] = f * W[k * last + (size_t)from];
+            s->c[i] += f * b[from];
+        }
+    }
+    for (size_t q = 0; q < s->rows; q++) {
+        size_t d = (size_t)s->dim, i = (size_t)s->row_node[q / d] * d + q % d;
+        s->c_rows[q] = s->c[i];
+        for (size_t k = 0; k < m; k++) s->B_rows[k * s->rows + q] = s->B[i * m + k];
+    }
+}
+
+// G += f b bᵀ for the row b of coordinate i.
+static void tss__reduced_rank_one(const tss_reduced *s, double f, size_t i, double *G) {
+    const double *b = s->B + i * s->m;
+    for (size_t a = 0; f != 0 && a < s->m; a++) tss__n_axpy(s->m, f * b[a], b, G + a * s->m);
+}
+
+static double tss__reduced_at(const tss_reduced *s, size_t i, const double *phi) {
+    return s->c[i] + tss__n_dot8(s->m, s->B + i * s->m, phi);
+}
+
+static void tss__reduced_fill(tss_reduced *s) {
+    for (size_t i = 0; i < s->n; i++) s->mass[i] = s->def.mass ? s->def.mass[i] : 1;
+    for (int i = 0; i < s->contacts; i++)
+        s->near_weight[i] = s->def.contact_weight ? s->def.contact_weight[i] : 1;
+    tss__reduced_affine(s);
+    for (size_t i = 0; i < s->n; i++) tss__reduced_rank_one(s, s->mass[i], i, s->G);
+    memcpy(s->G_free, s->G, s->m * s->m * sizeof(double));
+}
+
+// elements NULL: for projection alone.
+static tss_result tss__reduced_make(const tss_host *host, const tss_reduced_def *def, int dim,
+                                    tss_reduced **out) {
+    const tss_net *net = def->decoder;
+    tss_reduced *s = (tss_reduced *)tss_alloc(host, sizeof *s);
+    if (!s) return TSS_ERROR_NO_MEMORY;
+    memset(s, 0, sizeof *s);
+    s->host = *host, s->def = *def, s->r = net->inputs, s->n = (size_t)net->outputs, s->dim = dim;
+    s->nodes = net->outputs / dim;
+    s->top = net->layers - 1;
+    if (net->map == TSS__MAP_MATRIX && net->width[net->layers] < net->width[s->top])
+        s->top = net->layers;
+    s->m = (size_t)net->width[s->top];
+    s->k_most = s->r <= TSS__REDUCED_DENSE ? s->r : 0;
+    if (def->sdf) s->contacts = def->contact_node ? def->contact_count : s->nodes;
+    if (!tss__reduced_arrays(s)) {
+        tss_reduced_destroy(s);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    tss__reduced_fill(s);
+    if (tss_reduced_set(s, def->start ? def->start : s->z) != TSS_OK) {
+        tss_reduced_destroy(s);
+        return tss__n_refuse(host, TSS_ERROR_BAD_ARGUMENT,
+                             "reduced solver: start or f(start) is not finite");
+    }
+    *out = s;
+    return TSS_OK;
 }
 
 tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def, tss_reduced **out) {
     tss_host h = host ? *host : tss_host_default();
     *out = NULL;
     TSS_ASSERT(def->cookie == TSS__REDUCED_COOKIE && "tss_reduced_def: start from the default");
+    if (!def->decoder || !def->elements || !tss__n_fits(def->decoder, def->elements))
+        return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT,
+                             "reduced solver: decoder and elements do not fit each other");
     const char *wrong = tss__reduced_complaint(def);
+    if (!wrong) wrong = tss__contact_complaint(def, def->elements->nodes);
     if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
-    tss_reduced *s = (tss_reduced *)tss_alloc(&h, sizeof *s);
-    if (!s) return TSS_ERROR_NO_MEMORY;
-    memset(s, 0, sizeof *s);
-    s->host = h, s->def = *def, s->r = def->decoder->inputs, s->n = (size_t)def->decoder->outputs;
-    if (!tss__reduced_arrays(s)) {
-        tss_reduced_destroy(s);
-        return TSS_ERROR_NO_MEMORY;
-    }
-    tss_result r = tss_reduced_set(s, def->start ? def->start : s->z);
-    if (r != TSS_OK) {
-        tss_reduced_destroy(s);
-        return tss__n_refuse(&h, r, "reduced solver: start or f(start) is not finite");
-    }
-    *out = s;
-    return TSS_OK;
+    return tss__reduced_make(&h, def, def->elements->dim, out);
 }
 
-// E at z; its gradient to g, f(z) is left in the job's x.
-static double tss__reduced_energy(tss_reduced *s, const double *z, double *g) {
-    tss__n_reduced *j = &s->job;
-    const tss__jetpass *p = &j->p;
-    double P, E, half = s->def.h > 0 ? 0.5 / (s->def.h * s->def.h) : 0;
-    j->z = z, j->P = &P;
-    s->evaluations++;
-    tss__jetpass_load(p, 0, z, NULL, 0), tss__jetpass_forward(p, 0), tss__jetpass_out(p, 0);
-    tss__reduced_elements(j, 0);
-    E = P;
-    for (size_t i = 0; i < s->n; i++) {
-        double gap = p->x[i] - s->q[i], m = half > 0 ? half * s->def.mass[i] : 0;
-        E += m * gap * gap - s->force[i] * p->x[i];
-        p->xbar[i] += 2 * m * gap - s->force[i];
+// ---- one evaluation -------------------------------------------------------------------------
+
+static double *tss__reduced_layer(const tss_reduced *s, double *tape, int l) {
+    return tape + (1 + (size_t)s->k_most) * s->def.decoder->off[l];
+}
+
+// σ of layer l on all rows; its first two derivatives stay for the way back.
+static void tss__reduced_activate(tss_reduced *s, int l, int k) {
+    const tss_net *net = s->def.decoder;
+    size_t w = (size_t)net->width[l];
+    double *S = tss__reduced_layer(s, s->mid, l), *H = tss__reduced_layer(s, s->tape, l);
+    double *d1 = s->slope + 2 * net->off[l], *d2 = d1 + w;
+    for (size_t o = 0; o < w; o++) {
+        double d[4];
+        tss__n_activate(net->activation, S[o], d);
+        H[o] = d[0], d1[o] = d[1], d2[o] = d[2];
     }
-    tss__jetpass_in_bar(p, 0, p->xbar);
-    memcpy(g, tss__jetpass_backward(p, 0, 0), (size_t)s->r * sizeof(double));
+    for (size_t a = 1; a <= (size_t)k; a++)
+        for (size_t o = 0; o < w; o++) H[a * w + o] = d1[o] * S[a * w + o];
+}
+
+// φ at z and, for k > 0, its derivatives along each z_a; row a of the result is along z_{a−1}.
+static double *tss__reduced_forward(tss_reduced *s, const double *z, int k) {
+    const tss_net *net = s->def.decoder;
+    size_t r = (size_t)s->r, K = (size_t)k;
+    double *in = tss__reduced_layer(s, s->tape, 0);
+    memcpy(in, z, r * sizeof(double));
+    if (k) tss__n_identity(in + r, k);
+    for (int l = 0; l < s->top; l++) {
+        size_t w = (size_t)net->width[l], out = (size_t)net->width[l + 1];
+        const double *W = net->par + net->theta[l], *x = tss__reduced_layer(s, s->tape, l);
+        int curved = l + 1 < net->layers;
+        double *S = tss__reduced_layer(s, curved ? s->mid : s->tape, l + 1);
+        memcpy(S, W + w * out, out * sizeof(double));
+        tss__n_combine(out, w, x, W, S);
+        tss__n_zero(S + out, K * out);
+        tss__n_product(K, out, w, tss__n_rows(x + w, w), tss__n_rows(W, out), S + out, out,
+                       s->panel);
+        if (curved) tss__reduced_activate(s, l + 1, k);
+    }
+    return tss__reduced_layer(s, s->tape, s->top);
+}
+
+// From the adjoint of φ (and its derivatives; s->bar) to the gradient and the rows of the Hessian.
+static void tss__reduced_backward(tss_reduced *s, int k, double *g, double *H) {
+    const tss_net *net = s->def.decoder;
+    size_t K = (size_t)k, r = (size_t)s->r;
+    double *bar = s->bar, *next = s->next;
+    for (int l = s->top; l > 0; l--) {
+        size_t w = (size_t)net->width[l], in = (size_t)net->width[l - 1];
+        const double *W = net->par + net->theta[l - 1], *S = tss__reduced_layer(s, s->mid, l);
+        const double *d1 = s->slope + 2 * net->off[l], *d2 = d1 + w;
+        if (l < net->layers) {
+            for (size_t a = 1; a <= K; a++)
+                for (size_t o = 0; o < w; o++)
+                    bar[a * w + o] = d1[o] * bar[a * w + o] + d2[o] * S[a * w + o] * bar[o];
+            for (size_t o = 0; o < w; o++) bar[o] *= d1[o];
+        }
+        for (size_t i = 0; i < in; i++) next[i] = tss__n_dot8(w, W + i * w, bar);
+        tss__n_zero(next + in, K * in);
+        tss__n_product(K, in, w, tss__n_rows(bar + w, w), tss__n_turned(tss__n_rows(W, w)),
+                       next + in, in, s->panel);
+        double *swap = bar;
+        bar = next, next = swap;
+    }
+    memcpy(g, bar, r * sizeof(double));
+    if (k) memcpy(H, bar + r, r * r * sizeof(double));
+}
+
+// C and its derivatives; the Hessian is k a n nᵀ.
+static double tss__reduced_contact(const tss_reduced *s, int k) {
+    int d = s->dim;
+    double C = 0;
+    for (int i = 0; i < s->contacts; i++) {
+        size_t at = (size_t)s->near[i] * (size_t)d;
+        double n[3] = {0}, f = s->def.contact_stiffness * s->near_weight[i];
+        double gap = s->def.sdf(s->def.sdf_user, s->X + at, n) - s->def.contact_margin;
+        if (isnan(gap)) return gap;
+        if (gap >= 0) continue;
+        C += 0.5 * f * gap * gap;
+        for (int a = 0; a < d; a++) s->Xbar[at + (size_t)a] += f * gap * n[a];
+        for (int q = 1; q <= k; q++) {
+            size_t row = (size_t)q * s->rows + at;
+            double along = f * tss__dot_n(d, n, s->X + row);
+            for (int a = 0; a < d; a++) s->Xbar[row + (size_t)a] += along * n[a];
+        }
+    }
+    return C;
+}
+
+// Rows of handles: where they are, or 0 (derivatives, adjoints).
+static void tss__reduced_hold(const tss_reduced *s, double *rows, int first, int k, int zero) {
+    size_t d = (size_t)s->dim, nodes = s->rows / d;
+    for (size_t q = 0; s->held[0].count && q < nodes; q++) {
+        int at = s->held[0].at[s->row_node[q]];
+        if (!at) continue;
+        for (int a = first; a <= k; a++)
+            for (size_t c = 0; c < d; c++)
+                rows[(size_t)a * s->rows + q * d + c] =
+                    zero || a ? 0 : s->held[0].x[(size_t)(at - 1) * d + c];
+    }
+}
+
+// P + C at φ; adds their adjoints to s->bar.
+static double tss__reduced_bodies(tss_reduced *s, const double *phi, int k) {
+    size_t T = s->rows, m = s->m, K = (size_t)k;
+    const tss_elements *e = s->def.elements;
+    double E = 0;
+    memcpy(s->X, s->c_rows, T * sizeof(double));
+    tss__n_combine(T, m, phi, s->B_rows, s->X);
+    tss__n_zero(s->X + T, K * T), tss__n_zero(s->Xbar, (1 + K) * T);
+    tss__n_product(K, T, m, tss__n_rows(phi + m, m), tss__n_rows(s->B_rows, T), s->X + T, T,
+                   s->panel);
+    tss__reduced_hold(s, s->X, 0, k, 0);
+    if (k == 0) {
+        E = tss__elements_gradient(e, s->cell, s->hinge, s->X, s->Xbar);
+    } else {
+        tss__n_jet t;
+        memset(&t, 0, sizeof t);
+        t.e = e, t.cell = s->cell, t.hinge = s->hinge, t.mode = TSS__CELL_TANGENT, t.k = k;
+        t.x = s->X, t.ld = T, t.bar = s->Xbar, t.scratch = s->scratch;
+        tss__jet_run(&t);
+        E = t.P;
+    }
+    if (s->contacts) E += tss__reduced_contact(s, k);
+    tss__reduced_hold(s, s->Xbar, 0, k, 1);
+    for (size_t a = 0; a < m; a++) s->bar[a] += tss__n_dot8(T, s->B_rows + a * T, s->Xbar);
+    tss__n_product(K, m, T, tss__n_rows(s->Xbar + T, T), tss__n_turned(tss__n_rows(s->B_rows, T)),
+                   s->bar + m, m, s->panel);
     return E;
+}
+
+// E at z, its gradient to g and its Hessian to H (NULL: not wanted).
+static double tss__reduced_energy(tss_reduced *s, const double *z, double *g, double *H) {
+    int k = H ? s->r : 0;
+    size_t m = s->m;
+    double *phi = tss__reduced_forward(s, z, k), E = s->offset;
+    if (H)
+        s->hessians++;
+    else
+        s->evaluations++;
+    // The quadratic: half ((φ − φ̄)ᵀ Q (φ − φ̄) − 2 w·(φ − φ̄) + constant) − u·φ.
+    for (size_t a = 0; a < m; a++) s->gap[a] = phi[a] - s->phi_bar[a];
+    tss__n_zero(s->bar, (1 + (size_t)k) * m);
+    for (size_t c = 0; s->half > 0 && c <= (size_t)k; c++) {
+        const double *v = c ? phi + c * m : s->gap;
+        for (size_t a = 0; a < m; a++)
+            s->bar[c * m + a] = 2 * s->half * tss__n_dot8(m, s->quad + a * m, v);
+    }
+    if (s->half > 0) {
+        E += 0.5 * tss__n_dot8(m, s->gap, s->bar) -
+             s->half * (2 * tss__n_dot8(m, s->w, s->gap) - s->constant);
+        for (size_t a = 0; a < m; a++) s->bar[a] -= 2 * s->half * s->w[a];
+    }
+    E -= tss__n_dot8(m, s->u, phi);
+    for (size_t a = 0; a < m; a++) s->bar[a] -= s->u[a];
+    if (!s->fit) E += tss__reduced_bodies(s, phi, k);
+    tss__reduced_backward(s, k, g, H);
+    return E;
+}
+
+// ---- state ----------------------------------------------------------------------------------
+
+static void tss__held_copy(const tss_reduced *s, const tss__n_held *from, tss__n_held *to) {
+    for (int k = 0; k < to->count; k++) to->at[to->node[k]] = 0;
+    to->count = from->count;
+    for (int k = 0; k < from->count; k++) to->at[to->node[k] = from->node[k]] = k + 1;
+    memcpy(to->x, from->x, (size_t)(from->count * s->dim) * sizeof(double));
+}
+
+// The state moves on: what is at x_t becomes x_{t−1}, φ(z) and the handles become x_t.
+static void tss__reduced_advance(tss_reduced *s) {
+    tss__n_held swap = s->held[2];
+    double *phi = s->phi_last;
+    s->held[2] = s->held[1], s->held[1] = swap;
+    s->phi_last = s->phi, s->phi = phi;
+    tss__held_copy(s, &s->held[0], &s->held[1]);
+    memcpy(s->phi, tss__reduced_forward(s, s->z, 0), s->m * sizeof(double));
+    *s->decoded = 0;
 }
 
 tss_result tss_reduced_set(tss_reduced *s, const double *z) {
     for (int i = 0; i < s->r; i++)
         if (!isfinite(z[i])) return TSS_ERROR_BAD_STATE;
-    tss__reduced_energy(s, z, s->g);
-    for (size_t i = 0; i < s->n; i++)
-        if (!isfinite(s->job.p.x[i])) return TSS_ERROR_BAD_STATE;
+    const double *phi = tss__reduced_forward(s, z, 0);
+    for (size_t a = 0; a < s->m; a++)
+        if (!isfinite(phi[a])) return TSS_ERROR_BAD_STATE;
     if (z != s->z) memcpy(s->z, z, (size_t)s->r * sizeof(double));
     memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
-    memcpy(s->x, s->job.p.x, s->n * sizeof(double));
-    memcpy(s->x_last, s->x, s->n * sizeof(double));
+    tss__reduced_advance(s);
+    tss__reduced_advance(s);
     return TSS_OK;
 }
 
@@ -3174,14 +4157,115 @@ void tss_reduced_set_force(tss_reduced *s, const double *force) {
         memcpy(s->force, force, s->n * sizeof(double));
     else
         tss__n_zero(s->force, s->n);
+    tss__n_zero(s->force_phi, s->m);
+    s->force_c = 0;
+    for (size_t i = 0; i < s->n; i++) {
+        if (s->force[i] == 0) continue;
+        s->force_c += s->force[i] * s->c[i];
+        tss__n_axpy(s->m, s->force[i], s->B + i * s->m, s->force_phi);
+    }
+}
+
+static const char *tss__handles_complaint(tss_reduced *s, int count, const int *node,
+                                          const double *x) {
+    if (count < 0 || count > s->nodes || (count > 0 && (!node || !x)))
+        return "reduced solver: handles without nodes or positions, or too many";
+    s->stamp++;
+    for (int k = 0; k < count; k++) {
+        if (node[k] < 0 || node[k] >= s->nodes) return "reduced solver: a handle is out of range";
+        if (s->seen[node[k]] == s->stamp) return "reduced solver: a handle is named twice";
+        s->seen[node[k]] = s->stamp;
+    }
+    for (int i = 0; i < count * s->dim; i++)
+        if (!isfinite(x[i])) return "reduced solver: a handle's position is not finite";
+    return NULL;
+}
+
+tss_result tss_reduced_set_handles(tss_reduced *s, int count, const int *node, const double *x) {
+    const char *wrong = tss__handles_complaint(s, count, node, x);
+    if (wrong) return tss__n_refuse(&s->host, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss__n_held *h = &s->held[0];
+    size_t d = (size_t)s->dim;
+    int same = count == h->count;
+    for (int k = 0; same && k < count; k++) same = node[k] == h->node[k];
+    if (count) memcpy(h->x, x, (size_t)count * d * sizeof(double));
+    if (same) return TSS_OK;
+    for (int k = 0; k < h->count; k++) h->at[h->node[k]] = 0;
+    memcpy(s->G_free, s->G, s->m * s->m * sizeof(double));
+    for (int k = 0; k < count; k++) {
+        h->node[k] = node[k], h->at[node[k]] = k + 1;
+        for (size_t a = 0; a < d; a++) {
+            size_t i = (size_t)node[k] * d + a;
+            tss__reduced_rank_one(s, -s->mass[i], i, s->G_free);
+        }
+    }
+    h->count = count;
+    return TSS_OK;
 }
 
 const double *tss_reduced_z(const tss_reduced *s) { return s->z; }
-const double *tss_reduced_x(const tss_reduced *s) { return s->x; }
 const uint64_t *tss_reduced_exits(const tss_reduced *s) { return s->exits; }
 
+const double *tss_reduced_x(const tss_reduced *s) {
+    if (*s->decoded) return s->x;
+    const tss__n_held *h = &s->held[1];
+    size_t wide = (size_t)s->dim;
+    for (size_t i = 0; i < s->n; i++) s->x[i] = tss__reduced_at(s, i, s->phi);
+    for (int k = 0; k < h->count; k++)
+        memcpy(s->x + (size_t)h->node[k] * wide, h->x + (size_t)k * wide, wide * sizeof(double));
+    *s->decoded = 1;
+    return s->x;
+}
+
+// Coordinate a of a node in a past state.
+static double tss__held_x(const tss_reduced *s, const tss__n_held *h, const double *phi, int node,
+                          int a) {
+    size_t i = (size_t)(node * s->dim + a);
+    int at = h->at[node];
+    return at ? h->x[(size_t)(at - 1) * (size_t)s->dim + (size_t)a] : tss__reduced_at(s, i, phi);
+}
+
+// What one node that was, or is, held does to the quadratic and the forces.
+static void tss__reduced_odd_node(tss_reduced *s, int node) {
+    for (int a = 0; a < s->dim; a++) {
+        size_t i = (size_t)(node * s->dim + a);
+        const double *b = s->B + i * s->m;
+        double q = 2 * tss__held_x(s, &s->held[1], s->phi, node, a) -
+                   tss__held_x(s, &s->held[2], s->phi_last, node, a);
+        int at = s->held[0].at[node];
+        if (at) {
+            double x = s->held[0].x[(size_t)(at - 1) * (size_t)s->dim + (size_t)a];
+            s->constant += s->mass[i] * (x - q) * (x - q);
+            s->offset -= s->force[i] * (x - s->c[i]);
+            tss__n_axpy(s->m, -s->force[i], b, s->u);
+        } else {
+            double off = q - tss__reduced_at(s, i, s->phi_bar);
+            s->constant += s->mass[i] * off * off;
+            tss__n_axpy(s->m, s->mass[i] * off, b, s->w);
+        }
+    }
+}
+
+// Sets up E of the step to come.
+static void tss__reduced_prepare(tss_reduced *s) {
+    s->fit = 0, s->half = s->def.h > 0 ? 0.5 / (s->def.h * s->def.h) : 0, s->quad = s->G_free;
+    s->constant = 0, s->offset = -s->force_c;
+    for (size_t a = 0; a < s->m; a++) s->phi_bar[a] = 2 * s->phi[a] - s->phi_last[a];
+    memcpy(s->u, s->force_phi, s->m * sizeof(double));
+    tss__n_zero(s->w, s->m);
+    const tss__n_held *h = s->held;
+    for (int k = 0; k < h[0].count; k++) tss__reduced_odd_node(s, h[0].node[k]);
+    for (int k = 0; k < h[1].count; k++)
+        if (!h[0].at[h[1].node[k]]) tss__reduced_odd_node(s, h[1].node[k]);
+    for (int k = 0; k < h[2].count; k++)
+        if (!h[0].at[h[2].node[k]] && !h[1].at[h[2].node[k]])
+            tss__reduced_odd_node(s, h[2].node[k]);
+}
+
+// ---- directions -----------------------------------------------------------------------------
+
 // d = −H g by the two loops over the history (Nocedal and Wright, algorithm 7.4).
-static void tss__reduced_direction(tss_reduced *s) {
+static void tss__reduced_lbfgs(tss_reduced *s) {
     int r = s->r, M = s->def.memory;
     for (int i = 0; i < r; i++) s->d[i] = -s->g[i];
     for (int k = 0; k < s->pairs; k++) {
@@ -3204,6 +4288,79 @@ static void tss__reduced_direction(tss_reduced *s) {
     }
 }
 
+// One rotation of Jacobi's method: A(p, q) to 0, V's rows p and q turn along.
+static void tss__eigen_turn(size_t r, double *A, double *V, size_t p, size_t q) {
+    double apq = A[p * r + q];
+    if (fabs(apq) <= 1e-16 * sqrt(fabs(A[p * r + p] * A[q * r + q])) || apq == 0) {
+        return;
+    }
+    double tau = (A[q * r + q] - A[p * r + p]) / (2 * apq);
+    double t = (tau >= 0 ? 1 : -1) / (fabs(tau) + sqrt(1 + tau * tau));
+    double c = 1 / sqrt(1 + t * t), n = t * c;
+    for (size_t i = 0; i < r; i++) {
+        double x = A[i * r + p], y = A[i * r + q];
+        A[i * r + p] = c * x - n * y, A[i * r + q] = n * x + c * y;
+    }
+    for (size_t i = 0; i < r; i++) {
+        double x = A[p * r + i], y = A[q * r + i];
+        A[p * r + i] = c * x - n * y, A[q * r + i] = n * x + c * y;
+        x = V[p * r + i], y = V[q * r + i];
+        V[p * r + i] = c * x - n * y, V[q * r + i] = n * x + c * y;
+    }
+}
+
+// A = Σ λ_i v_i v_iᵀ by cyclic Jacobi rotations; v_i are the rows of V, A is overwritten. Converges
+// quadratically; 30 sweeps are never needed.
+static void tss__eigen(int r_, double *A, double *V, double *lambda) {
+    size_t r = (size_t)r_;
+    tss__n_identity(V, r_);
+    for (int sweep = 0; sweep < 30; sweep++) {
+        double off = 0, all = 0;
+        for (size_t p = 0; p < r; p++)
+            for (size_t q = 0; q < r; q++) {
+                double a = A[p * r + q] * A[p * r + q];
+                all += a, off += p == q ? 0 : a;
+            }
+        if (!(off > 1e-30 * all)) break;
+        for (size_t p = 0; p + 1 < r; p++)
+            for (size_t q = p + 1; q < r; q++) tss__eigen_turn(r, A, V, p, q);
+    }
+    for (size_t p = 0; p < r; p++) lambda[p] = A[p * r + p];
+}
+
+// d = −(H₊ + shift)⁻¹ g, H₊ without negative eigenvalues. In a fit the shift is relative.
+static void tss__reduced_newton(tss_reduced *s) {
+    int r = s->r;
+    double most = 0, shift = s->def.shift;
+    tss__reduced_energy(s, s->z, s->g_new, s->H);
+    for (int a = 0; a < r; a++)
+        for (int b = 0; b < a; b++)
+            s->H[a * r + b] = s->H[b * r + a] = 0.5 * (s->H[a * r + b] + s->H[b * r + a]);
+    tss__eigen(r, s->H, s->V, s->lambda);
+    for (int a = 0; a < r; a++) most = s->lambda[a] > most ? s->lambda[a] : most;
+    if (s->fit) shift = 1e-12 * most + 1e-300;
+    tss__n_zero(s->d, (size_t)r);
+    for (int a = 0; a < r; a++) {
+        const double *v = s->V + a * r;
+        double l = (s->lambda[a] > 0 ? s->lambda[a] : 0) + shift;
+        tss__n_axpy((size_t)r, -tss__dot_n(r, v, s->g) / l, v, s->d);
+    }
+}
+
+// The next direction. Returns its slope, negative unless there is none.
+static double tss__reduced_direction(tss_reduced *s) {
+    int newton = s->fit ? s->k_most > 0 : s->def.solver == TSS_PROJECTED_NEWTON;
+    if (newton)
+        tss__reduced_newton(s);
+    else
+        tss__reduced_lbfgs(s);
+    double slope = tss__dot_n(s->r, s->g, s->d);
+    if (slope < 0 || newton) return slope;
+    s->pairs = 0;
+    tss__reduced_lbfgs(s);
+    return tss__dot_n(s->r, s->g, s->d);
+}
+
 // Keeps the pair of the step z → z_new if its curvature is safely positive.
 static void tss__reduced_learn(tss_reduced *s) {
     int r = s->r, M = s->def.memory, at = (s->newest + 1) % M;
@@ -3219,11 +4376,11 @@ static void tss__reduced_learn(tss_reduced *s) {
 // Backtracking (c1 = 1e-4, factor 0.8, as the paper's code) along d. 1: z_new, g_new, *E are
 // better. Where E itself is rounding, the slope decides (Hager and Zhang's approximate condition,
 // the same on a parabola).
-static int tss__reduced_line(tss_reduced *s, double *E) {
-    double t = 1, slope = tss__dot_n(s->r, s->g, s->d);
+static int tss__reduced_line(tss_reduced *s, double slope, double *E) {
+    double t = 1;
     for (int k = 0; k < s->def.max_line; k++, t *= 0.8) {
         for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
-        *E = tss__reduced_energy(s, s->z_new, s->g_new);
+        *E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
         if (!isfinite(*E)) continue;
         if (*E <= s->energy + 1e-4 * t * slope) return 1;
         if (*E <= s->energy + 1e-13 * fabs(s->energy) &&
@@ -3243,47 +4400,207 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
     size_t wide = (size_t)s->r * sizeof(double);
     s->pairs = 0, s->newest = 0;
     for (*iterations = 0;; ++*iterations) {
-        double E;
-        if (tss__n_largest(s->g, s->r) <= s->def.eps) return TSS_EXIT_CONVERGED;
+        double E, eps = s->fit ? 0 : s->def.eps;
+        if (tss__n_largest(s->g, s->r) <= eps) return TSS_EXIT_CONVERGED;
         if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
-        tss__reduced_direction(s);
-        if (!(tss__dot_n(s->r, s->g, s->d) < 0)) s->pairs = 0, tss__reduced_direction(s);
-        if (!tss__reduced_line(s, &E)) {
-            s->current = 0;
-            return TSS_EXIT_LINE_SEARCH;
-        }
+        double slope = tss__reduced_direction(s);
+        // −slope is the squared length in ‖·‖_M by which f would move.
+        if (s->fit && -slope <= 1e-20 * s->scale) return TSS_EXIT_CONVERGED;
+        if (!tss__reduced_line(s, slope, &E)) return TSS_EXIT_LINE_SEARCH;
         double fall = s->energy - E;
         tss__reduced_learn(s);
         memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
-        s->energy = E, s->current = 1;
-        if (tss__n_largest(s->g, s->r) <= s->def.eps) continue;  // counted as converged
-        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) {
+        s->energy = E;
+        if (tss__n_largest(s->g, s->r) <= eps) continue;  // counted as converged
+        if (!s->fit && s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) {
             ++*iterations;  // this one
             return TSS_EXIT_SADDLE;
         }
     }
 }
 
-tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
-    size_t wide = (size_t)s->r * sizeof(double), long_ = s->n * sizeof(double);
+// ---- steps ----------------------------------------------------------------------------------
+
+static tss_reduced_info tss__reduced_solve(tss_reduced *s) {
     tss_reduced_info info;
     memset(&info, 0, sizeof info);
-    s->evaluations = 0;
-    for (size_t i = 0; i < s->n; i++) s->q[i] = 2 * s->x[i] - s->x_last[i];
-    for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
-    memcpy(s->z_last, s->z, wide), memcpy(s->x_last, s->x, long_);
-    s->energy = tss__reduced_energy(s, s->z, s->g);
-    double E = tss__reduced_energy(s, s->z_new, s->g_new);
-    s->current = E < s->energy;
-    if (s->current) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
     info.exit = tss__reduced_minimise(s, &info.iterations);
-    if (!s->current) tss__reduced_energy(s, s->z, s->g_new);  // the last trial was not taken
     info.energy = s->energy, info.gradient = tss__n_largest(s->g, s->r);
-    memcpy(s->x, s->job.p.x, long_);
-    info.evaluations = s->evaluations;
+    info.evaluations = s->evaluations, info.hessians = s->hessians;
+    return info;
+}
+
+tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
+    size_t wide = (size_t)s->r * sizeof(double);
+    s->evaluations = s->hessians = 0;
+    tss__reduced_prepare(s);
+    for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
+    memcpy(s->z_last, s->z, wide);
+    s->energy = tss__reduced_energy(s, s->z, s->g, NULL);
+    double E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
+    if (E < s->energy) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
+    tss_reduced_info info = tss__reduced_solve(s);
+    tss__reduced_advance(s);
     s->exits[info.exit]++;
     if (out) *out = info;
     return TSS_OK;
+}
+
+// Σ m |x_i − mean|²: the squared size of x in ‖·‖_M.
+static double tss__reduced_size(const tss_reduced *s, const double *x) {
+    double all = 0;
+    for (size_t a = 0, d = (size_t)s->dim; a < d; a++) {
+        double mean = 0;
+        for (size_t i = a; i < s->n; i += d) mean += x[i] / s->nodes;
+        for (size_t i = a; i < s->n; i += d) all += s->mass[i] * (x[i] - mean) * (x[i] - mean);
+    }
+    return all;
+}
+
+tss_result tss_reduced_project(tss_reduced *s, const double *x, tss_reduced_info *out) {
+    for (size_t i = 0; i < s->n; i++)
+        if (!isfinite(x[i]))
+            return tss__n_refuse(&s->host, TSS_ERROR_BAD_ARGUMENT,
+                                 "reduced solver: a position to project is not finite");
+    // ½‖c + Bφ − x‖² about the φ that it starts from.
+    s->evaluations = s->hessians = 0;
+    s->fit = 1, s->half = 0.5, s->quad = s->G, s->constant = s->offset = 0;
+    s->scale = tss__reduced_size(s, x);
+    memcpy(s->phi_bar, tss__reduced_forward(s, s->z, 0), s->m * sizeof(double));
+    tss__n_zero(s->u, s->m), tss__n_zero(s->w, s->m);
+    for (size_t i = 0; i < s->n; i++) {
+        double gap = x[i] - tss__reduced_at(s, i, s->phi_bar);
+        s->constant += s->mass[i] * gap * gap;
+        tss__n_axpy(s->m, s->mass[i] * gap, s->B + i * s->m, s->w);
+    }
+    s->energy = tss__reduced_energy(s, s->z, s->g, NULL);
+    tss_reduced_info info = tss__reduced_solve(s);
+    if (out) *out = info;
+    return tss_reduced_set(s, s->z);
+}
+
+double tss_sdf_ball(void *ball, const double *x, double *n) {
+    const tss_ball *b = (const tss_ball *)ball;
+    double l = 0;
+    for (int a = 0; a < b->dim; a++) n[a] = x[a] - b->center[a], l += n[a] * n[a];
+    l = sqrt(l);
+    for (int a = 0; a < b->dim; a++) n[a] = l > 0 ? n[a] / l : a == 0;  // in the centre: any
+    return l - b->radius;
+}
+
+double tss_sdf_halfspace(void *halfspace, const double *x, double *n) {
+    const tss_halfspace *h = (const tss_halfspace *)halfspace;
+    double s = 0;
+    for (int a = 0; a < h->dim; a++) n[a] = h->normal[a], s += n[a] * (x[a] - h->point[a]);
+    return s;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>decoder_basis (private)
+// A reduced solver without elements finds z; with f = c + Bφ the Gram matrix of the tangent is
+// ∂φᵀ G ∂φ: columns are made orthonormal in the r rows of ∂φ, before B.
+// ---------------------------------------------------------------------------------------------
+
+struct tss_decoder_basis {
+    tss_host host;
+    tss_reduced *s;
+    const tss_net *encoder;
+    tss_work *work;
+    double *z;  // r: g(x)
+};
+
+void tss_decoder_basis_destroy(tss_decoder_basis *b) {
+    if (!b) return;
+    tss_host h = b->host;
+    if (b->s) tss_free(&h, b->z, (size_t)b->s->r * sizeof(double));
+    tss_reduced_destroy(b->s);
+    tss_work_destroy(b->work);
+    tss_free(&h, b, sizeof *b);
+}
+
+tss_result tss_decoder_basis_create(const tss_host *host, int dim, const tss_net *decoder,
+                                    const tss_net *encoder, const double *mass, const double *z,
+                                    tss_decoder_basis **out) {
+    tss_host h = host ? *host : tss_host_default();
+    tss_reduced_def d = tss_reduced_def_default();
+    const char *wrong = NULL;
+    *out = NULL;
+    d.decoder = decoder, d.mass = mass, d.start = z, d.h = 0;
+    if ((dim != 2 && dim != 3) || !decoder || decoder->has_in || decoder->outputs % dim)
+        wrong = "decoder basis: the decoder does not give positions of nodes";
+    else if (decoder->inputs > TSS__REDUCED_DENSE)
+        wrong = "decoder basis: more than 1024 inputs";
+    else if (encoder &&
+             (encoder->inputs != decoder->outputs || encoder->outputs != decoder->inputs))
+        wrong = "decoder basis: decoder and encoder do not fit each other";
+    else
+        wrong = tss__reduced_complaint(&d);
+    if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss_decoder_basis *b = (tss_decoder_basis *)tss_alloc(&h, sizeof *b);
+    if (!b) return TSS_ERROR_NO_MEMORY;
+    memset(b, 0, sizeof *b);
+    b->host = h, b->encoder = encoder;
+    tss_result r = tss__reduced_make(&h, &d, dim, &b->s);
+    if (r == TSS_OK) {
+        b->z = (double *)tss_alloc(&h, (size_t)b->s->r * sizeof(double));
+        r = b->z ? tss_work_create(&h, &b->work) : TSS_ERROR_NO_MEMORY;
+    }
+    // The encoder's scratch is taken now.
+    if (r == TSS_OK && encoder) r = tss_net_forward(encoder, b->work, 1, tss_reduced_x(b->s), b->z);
+    if (r != TSS_OK) {
+        tss_decoder_basis_destroy(b);
+        return r;
+    }
+    *out = b;
+    return TSS_OK;
+}
+
+static double tss__basis_product(tss_reduced *s, const double *u, const double *v) {  // uᵀ G v
+    for (size_t i = 0; i < s->m; i++) s->gap[i] = tss__n_dot8(s->m, s->G + i * s->m, v);
+    return tss__n_dot8(s->m, u, s->gap);
+}
+
+// The tangent's rows (derivatives of φ) made orthonormal in G, in their order, by Gram and Schmidt
+// twice; what depends on those before to 0.
+static void tss__basis_orthonormal(tss_reduced *s, double *rows) {
+    size_t m = s->m;
+    for (size_t a = 0; a < (size_t)s->r; a++) {
+        double *v = rows + a * m, before = tss__basis_product(s, v, v);
+        for (size_t b = 0; b < 2 * a; b++) {
+            const double *u = rows + b % a * m;
+            tss__n_axpy(m, -tss__basis_product(s, u, v), u, v);
+        }
+        double after = tss__basis_product(s, v, v),
+               unit = after > 1e-20 * before ? 1 / sqrt(after) : 0;
+        for (size_t i = 0; i < m; i++) v[i] *= unit;
+    }
+}
+
+void tss_decoder_basis_refresh(void *user, const tss_ctx *c, int first_node, int nodes,
+                               double *columns) {
+    tss_decoder_basis *b = (tss_decoder_basis *)user;
+    tss_reduced *s = b->s;
+    size_t n = (size_t)nodes * (size_t)c->dim, r = (size_t)s->r, m = s->m;
+    const double *x = c->x_t + (size_t)first_node * (size_t)c->dim;
+    if (n != s->n || c->dim != s->dim) {
+        tss_log(&b->host, TSS_LOG_ERROR, "decoder basis: %d nodes, the decoder has %d", nodes,
+                s->nodes);
+        tss__n_zero(columns, n * r);
+        return;
+    }
+    if (b->encoder && tss_net_forward(b->encoder, b->work, 1, x, b->z) == TSS_OK)
+        tss_reduced_set(s, b->z);
+    tss_reduced_project(s, x, NULL);
+    double *rows = tss__reduced_forward(s, s->z, s->r) + m;
+    tss__basis_orthonormal(s, rows);
+    for (size_t i = 0; i < n; i++)
+        for (size_t a = 0; a < r; a++)
+            columns[i * r + a] = tss__n_dot8(m, s->B + i * m, rows + a * m);
+}
+
+const double *tss_decoder_basis_z(const tss_decoder_basis *b) { return b->s->z; }
+tss_result tss_decoder_basis_set(tss_decoder_basis *b, const double *z) {
+    return tss_reduced_set(b->s, z);
 }
 
 #ifdef __cplusplus

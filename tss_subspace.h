@@ -4118,8 +4118,8 @@ static tss_result tss__sub_project_rows(tss_subspace *s, const tss_unknowns *u, 
     const size_t height = (size_t)mc->a;
     for (size_t j = 0; j < (size_t)mb->a; j++)  // of a body's own H the lower triangle
         for (int l = 0; l < lanes; l++) {
-            const double *from = p.lane + (size_t)l * p.lane_each + j * height;
-            for (size_t i = b == c ? j : 0; i < height; i++) H[j * height + i] += from[i];
+            const double *sum = p.lane + (size_t)l * p.lane_each + j * height;
+            for (size_t i = b == c ? j : 0; i < height; i++) H[j * height + i] += sum[i];
         }
     return TSS_OK;
 }
