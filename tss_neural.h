@@ -26,8 +26,8 @@
  *     tss_model_write(NULL, &m, "bar.tssn");
  *
  * tss_cubature_select (Eq. 11) finds few cells that stand for all of them in training; tss_reduced
- * (Eq. 2) simulates with a trained decoder. Not here yet: projected Newton, scripted handles and
- * contact in tss_reduced.
+ * (Eq. 2) simulates with a trained decoder, with scripted handles and contact against a signed
+ * distance.
  *
  * Jets: for directions D_a, a < k, and one symmetric matrix C (k × k) a pass carries
  *     y,   y_a = ∂_a y,   y_2 = Σ_ab C_ab ∂_a ∂_b y
@@ -394,9 +394,14 @@ TSS_API tss_result tss_training_step(tss_training *t, tss_training_info *info);
 
 // ---------------------------------------------------------------------------------------------
 // >>reduced_solver (public)
-// Eq. (2) by L-BFGS with backtracking: each step finds z that minimises
-//     E(z) = ‖f(z) − q̄‖²_M / (2h²) + P(f(z)) − force·f(z),   q̄ = 2 x_t − x_{t−1},
-// or, when h = 0 (quasi-static), the same without the first term.
+// Eq. (2): each step finds z that minimises
+//     E(z) = ‖f(z) − q̄‖²_M / (2h²) + P(f(z)) + C(f(z)) − force·f(z),   q̄ = 2 x_t − x_{t−1},
+// or, when h = 0 (quasi-static), the same without the first term. C is a penalty against a signed
+// distance φ (§5.2):
+//     C(x) = ½ k Σ_i a_i min(0, φ(x_i) − margin)².
+// f is affine in its last hidden layer: the first and last terms cost what a layer costs, and with
+// a cubature (elements of a subset) and a list of contact nodes a step does not depend on the size
+// of the mesh.
 // ---------------------------------------------------------------------------------------------
 
 typedef enum tss_exit {    // the paper's four (§5)
@@ -407,16 +412,38 @@ typedef enum tss_exit {    // the paper's four (§5)
     TSS_EXITS
 } tss_exit;
 
+typedef enum tss_reduced_method {
+    TSS_LBFGS,
+    // The exact Hessian of E in z (the curvature of f included; of C without ∇²φ), its negative
+    // eigenvalues put to 0, and `shift` added to all. r <= 1024; costs r + 1 columns an iteration.
+    TSS_PROJECTED_NEWTON,
+} tss_reduced_method;
+
 typedef struct tss_reduced_def {
-    const tss_net *decoder;        // borrowed, as is the rest
-    const tss_elements *elements;  // all, or a cubature
-    const double *mass;            // of each coordinate, kg; required when h > 0
+    // Its last layers and maps are copied; the layers before are borrowed. Neither may change.
+    const tss_net *decoder;
+    const tss_elements *elements;  // all, or a cubature; borrowed
+    const double *mass;            // of each coordinate, kg, copied; required when h > 0; NULL: 1
     const double *start;           // r numbers; NULL: 0
     double h;                      // s; 0: quasi-static. Default 0.05
     double eps;                    // J per unit of z, >= 0; default 1e-5
     double ftol;  // 0 <= ftol; default 2.2e-9 (L-BFGS-B's, which the paper's code uses); 0: never
     int memory;   // pairs, 1..64; default 10
     int max_line, max_iterations;  // defaults 128, 1024
+    tss_reduced_method solver;     // default TSS_LBFGS
+    double shift;  // PROJECTED_NEWTON: > 0, J per unit of z², absolute as in the paper's code (so
+                   // it depends on the scale of z and of the energy); default 1e-6
+    // Signed distance at x (dim numbers), m, negative inside; writes its gradient, of length 1, to
+    // n (dim). NULL (default): no contact. Called in every evaluation, from the thread that steps.
+    // An obstacle moves if what sdf_user points to is changed between steps.
+    double (*sdf)(void *user, const double *x, double *n);
+    void *sdf_user;
+    double contact_stiffness;  // k >= 0; N/m if a is a number, N/m³ for an area, 1/s² for a mass;
+                               // default 0
+    double contact_margin;     // m; default 0
+    int contact_count;         // nodes that are tested; used if contact_node is not NULL
+    const int *contact_node;   // each at most once; copied. NULL (default): every node
+    const double *contact_weight;  // a_i >= 0 of each of them, copied; NULL: 1
     int cookie;
 } tss_reduced_def;
 TSS_API tss_reduced_def tss_reduced_def_default(void);
@@ -425,23 +452,53 @@ typedef struct tss_reduced_info {
     tss_exit exit;
     int iterations, evaluations;  // of E with its gradient
     double energy, gradient;      // E and ‖∇E‖∞ at the end
+    int hessians;                 // of PROJECTED_NEWTON
 } tss_reduced_info;
 
-typedef struct tss_reduced tss_reduced;  // opaque
-// Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
+typedef struct tss_reduced tss_reduced;  // opaque; one thread at a time, tss_reduced_x included
+// Memory: 2 copies of the last layer (coordinates × width), the second only of the rows that
+// elements and contact touch. Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then
+// NULL.
 TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
                                       tss_reduced **out);
 TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
 // One step; starts from z_t, or from 2 z_t − z_{t−1} where E is lower. Allocates nothing. info may
 // be NULL. Errors: none; how it ended is info.exit, and the state is the best that was found.
 TSS_API tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *info);
-TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);  // at rest in f(z)
+// At rest in f(z), handles where they are. Errors: BAD_STATE (not finite), the state is as before.
+TSS_API tss_result tss_reduced_set(tss_reduced *s, const double *z);
+// At rest in the f(z) that minimises ½‖f(z) − x‖²_M (without handles), from the current z, by
+// projected Newton (L-BFGS if r > 1024). x: coordinates, m. info (NULL allowed): energy is that
+// minimum, gradient of it; CONVERGED: the next iteration would move f by less than 1e-10 of the
+// size of x, both in ‖·‖_M. Not counted in tss_reduced_exits. Allocates nothing. Errors:
+// BAD_ARGUMENT (x is not finite), the state is as before.
+TSS_API tss_result tss_reduced_project(tss_reduced *s, const double *x, tss_reduced_info *info);
+// Scripted nodes: in the steps to come node[k] is at x[k] (count × dim, m) and not where f(z) puts
+// it, until changed; count 0: none. What they do to E does not move z but through the elements
+// they share with other nodes. Copied; allocates nothing; cheaper if the nodes stay the same.
+// Errors: BAD_ARGUMENT (node out of range or twice, not finite; the log says what), nothing changes
+// then.
+TSS_API tss_result tss_reduced_set_handles(tss_reduced *s, int count, const int *node,
+                                           const double *x);
 // Force on each coordinate, N, until changed; copied. NULL: none.
 TSS_API void tss_reduced_set_force(tss_reduced *s, const double *force);
 TSS_API const double *tss_reduced_z(const tss_reduced *s);  // r
-TSS_API const double *tss_reduced_x(const tss_reduced *s);  // coordinates, f(z)
+// Coordinates: f(z), handles where they are. Decoded by the first call after a step.
+TSS_API const double *tss_reduced_x(const tss_reduced *s);
 TSS_API const uint64_t *tss_reduced_exits(
     const tss_reduced *s);  // TSS_EXITS counts since the start
+
+// Signed distances for tss_reduced_def.sdf; user points to the struct.
+typedef struct tss_ball {  // φ = ‖x − center‖ − radius
+    int dim;
+    double center[3], radius;  // m
+} tss_ball;
+typedef struct tss_halfspace {  // φ = normal·(x − point): what lies against the normal is inside
+    int dim;
+    double point[3], normal[3];  // m; of length 1
+} tss_halfspace;
+TSS_API double tss_sdf_ball(void *ball, const double *x, double *n);
+TSS_API double tss_sdf_halfspace(void *halfspace, const double *x, double *n);
 
 #ifdef __cplusplus
 }
@@ -1243,16 +1300,20 @@ tss_result tss_net_backward(const tss_net *n, tss_work *w, int batch, const doub
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__ELEMENTS_COOKIE 0x656c65
+#define TSS__N_CELL 12  // numbers of a cell or hinge in a column of scratch
 
 struct tss_elements {
     tss_host host;
     int dim, nodes, cells;  // cells: of the subset
+    int per;                // nodes of a cell
+    int hinges;             // of a shell
     int used;               // nodes that have a cell
     void *p;                // one block
     size_t bytes;
     double *Dinv, *vol, *mu, *la;  // cells × d², then w·vol, μ, λ'
     int *cell, *local;             // cells × (d+1): nodes; the same, numbered within dof
     int *dof;                      // used × d coordinates
+    int *hinge;                    // hinges × 4 nodes
 };
 
 static void tss__mat_cross(const double A[9], const double B[9], double out[9]) {
@@ -1456,7 +1517,8 @@ static tss_elements *tss__elements_alloc(const tss_host *h, const tss_elements_d
     tss_elements *e = (tss_elements *)tss_alloc(h, sizeof *e);
     if (!e) return NULL;
     memset(e, 0, sizeof *e);
-    e->host = *h, e->dim = d->dim, e->nodes = d->nodes, e->cells = d->subset ? d->count : d->cells;
+    e->host = *h, e->dim = d->dim, e->per = d->dim + 1, e->nodes = d->nodes,
+    e->cells = d->subset ? d->count : d->cells;
     size_t m = (size_t)e->cells, dim = (size_t)d->dim, most = (size_t)d->nodes;
     if (m * (dim + 1) < most) most = m * (dim + 1);  // nodes that can be used
     e->bytes =
@@ -1504,7 +1566,7 @@ enum { TSS__CELL_VALUE, TSS__CELL_REVERSE, TSS__CELL_TANGENT };
 
 typedef struct tss__n_jet {  // one sample; rows of x: base, k, second
     const tss_elements *e;
-    const int *cell;  // e->cell or e->local: how rows are numbered
+    const int *cell, *hinge;  // of e, or numbered as the rows are
     int mode, k, second;
     const double *x;
     size_t ld;        // from row to row
@@ -1513,7 +1575,7 @@ typedef struct tss__n_jet {  // one sample; rows of x: base, k, second
     const double *beta;  // k, or NULL: 0
     double *bar;         // rows as x, added to; NULL: VALUE
     double P, P2, *P1;   // P1: k, or NULL
-    double *scratch;     // (3 cols + 2)·9
+    double *scratch;     // (3 cols + 2)·TSS__N_CELL
 } tss__n_jet;
 
 static void tss__jet_gather(const tss__n_jet *t, int k, int cols, double *F) {
@@ -1618,14 +1680,127 @@ static void tss__jet_run(tss__n_jet *t) {
     }
 }
 
+// ---- the gradient alone, eight cells at a time ------------------------------------------------
+
+// Ψ and w·vol·P of eight cells from F; entry i of cell l at [i][l]. The same formulas as
+// tss__cell_at, in loops that a compiler turns into vector instructions.
+typedef struct tss__n_lanes {
+    double F[9][8], Dinv[9][8], mu[8], la[8], vol[8], psi[8];
+} tss__n_lanes;
+
+static void tss__lanes3(tss__n_lanes *q) {
+    for (int l = 0; l < 8; l++) {
+        double a = q->F[0][l], b = q->F[1][l], c = q->F[2][l], d = q->F[3][l], e = q->F[4][l],
+               f = q->F[5][l], g = q->F[6][l], h = q->F[7][l], i = q->F[8][l];
+        double mu = q->mu[l], la = q->la[l], A = a - 1, E = e - 1, I = i - 1;
+        double K0 = e * i - f * h, K1 = f * g - d * i, K2 = d * h - e * g;
+        double K3 = c * h - b * i, K4 = a * i - c * g, K5 = b * g - a * h;
+        double K6 = b * f - c * e, K7 = c * d - a * f, K8 = a * e - b * d;
+        double two = A * E - b * d + A * I - c * g + E * I - f * h;
+        double three = A * (E * I - f * h) - b * (d * I - f * g) + c * (d * h - E * g);
+        double j0 = A + E + I + two + three;
+        double gap0 = A * A + b * b + c * c + d * d + E * E + f * f + g * g + h * h + I * I -
+                      2 * two - 2 * three;
+        double xx = 2 * A + (A * A + d * d + g * g), yy = 2 * E + (b * b + E * E + h * h);
+        double zz = 2 * I + (c * c + f * f + I * I), xy = b + d + (A * b + d * E + g * h);
+        double xz = c + g + (A * c + d * f + g * I), yz = f + h + (b * c + E * f + h * I);
+        double size = xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz);
+        two = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz;
+        three = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz);
+        int small = size <= TSS__N_SMALL && j0 > -1;
+        double j1 = (xx + yy + zz + two + three) / (small ? 2 + j0 : 1);
+        double j = small ? j1 : j0, gap = small ? j1 * j1 - two - three : gap0;
+        double s = la * j - mu;
+        q->psi[l] = 0.5 * (mu * gap + la * j * j);
+        q->F[0][l] = mu * a + s * K0, q->F[1][l] = mu * b + s * K1, q->F[2][l] = mu * c + s * K2;
+        q->F[3][l] = mu * d + s * K3, q->F[4][l] = mu * e + s * K4, q->F[5][l] = mu * f + s * K5;
+        q->F[6][l] = mu * g + s * K6, q->F[7][l] = mu * h + s * K7, q->F[8][l] = mu * i + s * K8;
+    }
+}
+
+static void tss__lanes2(tss__n_lanes *q) {
+    for (int l = 0; l < 8; l++) {
+        double a = q->F[0][l], b = q->F[1][l], c = q->F[2][l], d = q->F[3][l];
+        double mu = q->mu[l], la = q->la[l], A = a - 1, D = d - 1, two = A * D - b * c;
+        double j0 = A + D + two, gap0 = A * A + b * b + c * c + D * D - 2 * two;
+        double xx = 2 * A + (A * A + c * c), yy = 2 * D + (b * b + D * D);
+        double xy = b + c + (A * b + c * D);
+        int small = xx * xx + yy * yy + 2 * xy * xy <= TSS__N_SMALL && j0 > -1;
+        two = xx * yy - xy * xy;
+        double j1 = (xx + yy + two) / (small ? 2 + j0 : 1);
+        double j = small ? j1 : j0, gap = small ? j1 * j1 - two : gap0, s = la * j - mu;
+        q->psi[l] = 0.5 * (mu * gap + la * j * j);
+        q->F[0][l] = mu * a + s * d, q->F[1][l] = mu * b - s * c;
+        q->F[2][l] = mu * c - s * b, q->F[3][l] = mu * d + s * a;
+    }
+}
+
+// F of `count` <= 8 cells from cell k on; the other lanes are at rest. D and G below are 2 or 3 and
+// known when this is compiled.
+static inline void tss__lanes_gather(const tss_elements *e, const int *cell, int k, int count,
+                                     const double *x, const int d, tss__n_lanes *q) {
+    double edge[9][8];
+    for (int l = 0; l < 8; l++) {
+        int at = l < count ? k + l : k;
+        const int *v = cell + at * (d + 1);
+        const double *Dinv = e->Dinv + at * d * d;
+        for (int r = 0; r < d; r++)
+            for (int i = 0; i < d; i++) edge[r * d + i][l] = x[v[i + 1] * d + r] - x[v[0] * d + r];
+        for (int i = 0; i < d * d; i++) q->Dinv[i][l] = Dinv[i];
+        q->mu[l] = e->mu[at], q->la[l] = e->la[at], q->vol[l] = l < count ? e->vol[at] : 0;
+    }
+    for (int r = 0; r < d; r++)
+        for (int m = 0; m < d; m++)
+            for (int l = 0; l < 8; l++) {
+                double s = 0;
+                for (int i = 0; i < d; i++) s += edge[r * d + i][l] * q->Dinv[i * d + m][l];
+                q->F[r * d + m][l] = s;
+            }
+}
+
+static inline void tss__lanes_scatter(const int *cell, int k, int count, const int d,
+                                      const tss__n_lanes *q, double *g) {
+    double f[9][8];
+    for (int r = 0; r < d; r++)
+        for (int i = 0; i < d; i++)
+            for (int l = 0; l < 8; l++) {
+                double s = 0;
+                for (int m = 0; m < d; m++) s += q->F[r * d + m][l] * q->Dinv[i * d + m][l];
+                f[r * d + i][l] = q->vol[l] * s;
+            }
+    for (int l = 0; l < count; l++) {
+        const int *v = cell + (k + l) * (d + 1);
+        for (int r = 0; r < d; r++)
+            for (int i = 0; i < d; i++)
+                g[v[i + 1] * d + r] += f[r * d + i][l], g[v[0] * d + r] -= f[r * d + i][l];
+    }
+}
+
+static double tss__lanes_run(const tss_elements *e, const int *cell, const double *x, double *g) {
+    double P = 0;
+    for (int k = 0; k < e->cells; k += 8) {
+        tss__n_lanes q;
+        int count = e->cells - k < 8 ? e->cells - k : 8;
+        if (e->dim == 3)
+            tss__lanes_gather(e, cell, k, count, x, 3, &q), tss__lanes3(&q);
+        else
+            tss__lanes_gather(e, cell, k, count, x, 2, &q), tss__lanes2(&q);
+        for (int l = 0; l < count; l++) P += q.vol[l] * q.psi[l];
+        if (g && e->dim == 3) tss__lanes_scatter(cell, k, count, 3, &q, g);
+        if (g && e->dim == 2) tss__lanes_scatter(cell, k, count, 2, &q, g);
+    }
+    return P;
+}
+
+// P at x; its gradient is added to g (NULL: not wanted). Nodes are numbered as in cell and hinge.
+static double tss__elements_gradient(const tss_elements *e, const int *cell, const int *hinge,
+                                     const double *x, double *g) {
+    (void)hinge;
+    return tss__lanes_run(e, cell, x, g);
+}
+
 double tss_elements_potential(const tss_elements *e, const double *x, double *g) {
-    double scratch[5 * 9];
-    tss__n_jet t;
-    memset(&t, 0, sizeof t);
-    t.e = e, t.cell = e->cell, t.mode = g ? TSS__CELL_REVERSE : TSS__CELL_VALUE;
-    t.x = x, t.alpha = 1, t.bar = g, t.scratch = scratch;
-    tss__jet_run(&t);
-    return t.P;
+    return tss__elements_gradient(e, e->cell, e->hinge, x, g);
 }
 
 tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, const double *x1,
@@ -1634,7 +1809,7 @@ tss_result tss_elements_jets(const tss_elements *e, int k, const double *x, cons
                              double *x1_bar, double *x2_bar) {
     if (k < 0 || (k > 0 && !x1) || !C != !x2 || (C && k == 0)) return TSS_ERROR_BAD_ARGUMENT;
     size_t n = (size_t)(e->nodes * e->dim), wide = n * sizeof(double), K = (size_t)k;
-    size_t cols = 1 + K + (C != NULL), count = 2 * cols * n + 9 * (3 * cols + 2);
+    size_t cols = 1 + K + (C != NULL), count = 2 * cols * n + TSS__N_CELL * (3 * cols + 2);
     double *p = (double *)tss_alloc(&e->host, count * sizeof(double));
     if (!p) return TSS_ERROR_NO_MEMORY;
     tss__n_zero(p, count);
@@ -1695,7 +1870,7 @@ static void tss__reduced_plan(tss__n_reduced *j, tss__n_slab *s, int theta) {
     int reverse = j->mode != TSS__CELL_VALUE;
     tss__jetpass_plan(&j->p, s,
                       TSS__PASS_X | (reverse ? TSS__PASS_XBAR : 0) | (theta ? TSS__PASS_THETA : 0));
-    j->cell_scratch = tss__n_take(s, j->p.chunks, (size_t)(3 * j->p.cols + 2) * 9);
+    j->cell_scratch = tss__n_take(s, j->p.chunks, (size_t)(3 * j->p.cols + 2) * TSS__N_CELL);
     j->betas = tss__n_take(s, 1, (size_t)j->p.k);
 }
 
@@ -1713,7 +1888,7 @@ static void tss__reduced_elements(tss__n_reduced *j, int c) {
         t.C = p->second ? p->C + (size_t)i * (size_t)(p->k * p->k) : NULL;
         t.alpha = j->alpha ? j->alpha[i] : j->all_alpha, t.beta = j->betas, t.gamma = j->gamma;
         t.bar = j->mode != TSS__CELL_VALUE ? p->xbar + row : NULL;
-        t.scratch = j->cell_scratch + (size_t)c * (size_t)(3 * p->cols + 2) * 9;
+        t.scratch = j->cell_scratch + (size_t)c * (size_t)(3 * p->cols + 2) * TSS__N_CELL;
         tss__jet_run(&t);
         if (j->P) j->P[i] = t.P;
         if (j->P2) j->P2[i] = t.P2;
@@ -3026,23 +3201,53 @@ tss_result tss_training_step(tss_training *t, tss_training_info *out) {
 
 // ---------------------------------------------------------------------------------------------
 // >>reduced_solver (private)
+// With φ(z) the values that the decoder's last linear map takes (its last hidden layer, or the
+// MLP's output where the fixed matrix has fewer columns), f(z) = c + B φ. So
+//     ‖f − q̄‖²_M = (φ − φ̄)ᵀ G (φ − φ̄) − 2 w·(φ − φ̄) + const,   G = BᵀMB, φ̄ = 2φ_t − φ_{t−1},
+// and force·f is linear. Handles leave G (rank-one terms, when their nodes change) and make w: the
+// rows of nodes whose x_t or x_{t−1} were not on c + Bφ. Only the rows of B that elements and
+// contact touch are multiplied in an evaluation: `rows` of them, transposed and contiguous.
 // ---------------------------------------------------------------------------------------------
 
 #define TSS__REDUCED_COOKIE 0x726564
+#define TSS__REDUCED_DENSE 1024  // r up to which there is a Hessian
+
+typedef struct tss__n_held {  // nodes that are not where f puts them
+    int count, *node, *at;    // at: of each node of the mesh, 1 + its place in node; 0: not held
+    double *x;                // count × dim
+} tss__n_held;
 
 struct tss_reduced {
     tss_host host;
     tss_reduced_def def;
-    tss_work *work;
-    tss__n_reduced job;
-    int r, pairs, newest;  // pairs kept of the L-BFGS history
-    size_t n;
+    int r, dim, nodes, top;  // top: linear layers before φ
+    int k_most;              // directions of an evaluation: r or 0
+    int pairs, newest;       // of the L-BFGS history
+    size_t n, m, rows, panel_size;
     double *p;  // one block
     size_t bytes;
-    double *z, *z_last, *x, *x_last, *q, *force;           // state; x_last: x_{t−1}
+    int *ints;  // another
+    size_t int_bytes;
+    double *mass, *force, *c, *B, *G, *G_free;  // n, n, n, n × m, m × m twice
+    double *c_rows, *B_rows;                    // rows; m × rows
+    int *row_node;                              // rows / dim: nodes of the rows, ascending
+    int *cell, *hinge, *near, contacts;         // of the elements, and contact nodes, by row
+    double *near_weight;
+    double *z, *z_last, *phi, *phi_last, *x;  // state; x is decoded on demand
+    int *decoded;
+    tss__n_held held[3];  // from now on; at x_t; at x_{t−1}
+    unsigned *seen, stamp;
+    double *force_phi, force_c;  // Bᵀ force, force·c
+    // What an evaluation minimises: half·(the quadratic) + the rest, unless fit.
+    int fit;
+    double half, offset, constant;  // constant: of the quadratic; offset: of the forces
+    const double *quad;
+    double *phi_bar, *w, *u, *gap;
+    double *tape, *slope, *mid, *bar, *next, *X, *Xbar, *panel, *scratch;
     double *S, *Y, *curve, *part, *g, *g_new, *d, *z_new;  // S, Y: memory × r
-    double energy;
-    int evaluations, current;  // 1: the last evaluation was at z
+    double *H, *V, *lambda;                                // r × r twice, r
+    double energy, scale;
+    int evaluations, hessians;
     uint64_t exits[TSS_EXITS];
 };
 
@@ -3050,95 +3255,437 @@ tss_reduced_def tss_reduced_def_default(void) {
     tss_reduced_def d;
     memset(&d, 0, sizeof d);
     d.h = 0.05, d.eps = 1e-5, d.ftol = 2.2e-9, d.memory = 10, d.max_line = 128,
-    d.max_iterations = 1024;
+    d.max_iterations = 1024, d.shift = 1e-6;
     d.cookie = TSS__REDUCED_COOKIE;
     return d;
 }
 
 static const char *tss__reduced_complaint(const tss_reduced_def *d) {
-    if (!d->decoder || !d->elements || !tss__n_fits(d->decoder, d->elements))
-        return "reduced solver: decoder and elements do not fit each other";
     if (!(d->h >= 0 && d->h < 1e300)) return "reduced solver: h must be >= 0";
     if (d->h > 0 && !d->mass) return "reduced solver: dynamics need masses";
+    for (int i = 0; d->mass && i < d->decoder->outputs; i++)
+        if (!(d->mass[i] >= 0 && d->mass[i] < 1e300))
+            return "reduced solver: a mass is negative or not finite";
     if (!(d->eps >= 0) || !(d->ftol >= 0)) return "reduced solver: a tolerance is negative";
     if (d->memory < 1 || d->memory > 64 || d->max_line < 1 || d->max_iterations < 0)
         return "reduced solver: memory, max_line or max_iterations out of range";
+    if (d->decoder->inputs > (1 << 24)) return "reduced solver: more than 2^24 inputs";
+    if (d->solver != TSS_LBFGS && d->solver != TSS_PROJECTED_NEWTON)
+        return "reduced solver: unknown solver";
+    if (d->solver == TSS_PROJECTED_NEWTON && d->decoder->inputs > TSS__REDUCED_DENSE)
+        return "reduced solver: projected Newton takes at most 1024 inputs";
+    if (!(d->shift > 0 && d->shift < 1e300)) return "reduced solver: shift must be > 0";
+    return NULL;
+}
+
+static const char *tss__contact_complaint(const tss_reduced_def *d, int nodes) {
+    if (!d->sdf) return NULL;
+    int count = d->contact_node ? d->contact_count : nodes;
+    if (!(d->contact_stiffness >= 0 && d->contact_stiffness < 1e300) ||
+        !isfinite(d->contact_margin))
+        return "reduced solver: contact_stiffness or contact_margin out of range";
+    if (count < 0 || count > nodes) return "reduced solver: contact_count out of range";
+    for (int i = 0; d->contact_node && i < count; i++)
+        if (d->contact_node[i] < 0 || d->contact_node[i] >= nodes)
+            return "reduced solver: a contact node is out of range";
+    for (int i = 0; d->contact_weight && i < count; i++)
+        if (!(d->contact_weight[i] >= 0 && d->contact_weight[i] < 1e300))
+            return "reduced solver: a contact weight is negative or not finite";
     return NULL;
 }
 
 void tss_reduced_destroy(tss_reduced *s) {
     if (!s) return;
     tss_host h = s->host;
-    tss_work_destroy(s->work);
     tss_free(&h, s->p, s->bytes);
+    tss_free(&h, s->ints, s->int_bytes);
     tss_free(&h, s, sizeof *s);
 }
 
+// ---- memory ---------------------------------------------------------------------------------
+
+// The nodes whose rows an evaluation needs: held[0].at serves as their mark. Sets rows.
+static void tss__reduced_mark(tss_reduced *s) {
+    const tss_elements *e = s->def.elements;
+    int *mark = s->held[0].at;
+    for (int i = 0; e && i < e->used; i++) mark[e->dof[i * s->dim] / s->dim] = 1;
+    for (int i = 0; i < s->contacts; i++) mark[s->near[i]] = 1;
+    s->rows = 0;
+    for (int i = 0; i < s->nodes; i++) {
+        if (!mark[i]) continue;
+        s->row_node[s->rows] = i, mark[i] = (int)++s->rows;
+    }
+}
+
+// Numbers cells, hinges and contact nodes by rows, and takes the marks away.
+static void tss__reduced_number(tss_reduced *s) {
+    const tss_elements *e = s->def.elements;
+    int *mark = s->held[0].at;
+    for (int i = 0; e && i < e->cells * e->per; i++) s->cell[i] = mark[e->cell[i]] - 1;
+    for (int i = 0; e && i < 4 * e->hinges; i++) s->hinge[i] = mark[e->hinge[i]] - 1;
+    for (int i = 0; i < s->contacts; i++) s->near[i] = mark[s->near[i]] - 1;
+    memset(mark, 0, (size_t)s->nodes * sizeof(int));
+    s->rows *= (size_t)s->dim;
+}
+
+static int tss__reduced_ints(tss_reduced *s) {
+    const tss_elements *e = s->def.elements;
+    size_t nodes = (size_t)s->nodes, cells = e ? (size_t)e->cells * (size_t)e->per : 0;
+    size_t hinges = e ? 4 * (size_t)e->hinges : 0, near = (size_t)s->contacts;
+    size_t all = 8 * nodes + cells + hinges + near + 1;
+    s->int_bytes = all * sizeof(int);
+    s->ints = (int *)tss_alloc(&s->host, s->int_bytes);
+    if (!s->ints) return 0;
+    memset(s->ints, 0, s->int_bytes);
+    int *p = s->ints;
+    for (int k = 0; k < 3; k++) s->held[k].node = p, s->held[k].at = p + nodes, p += 2 * nodes;
+    s->seen = (unsigned *)(void *)p, s->row_node = p + nodes, p += 2 * nodes;
+    s->cell = p, s->hinge = p + cells, s->near = s->hinge + hinges, s->decoded = s->near + near;
+    for (int i = 0; i < s->contacts; i++)
+        s->near[i] = s->def.contact_node ? s->def.contact_node[i] : i;
+    tss__reduced_mark(s);
+    tss__reduced_number(s);
+    return 1;
+}
+
 static void tss__reduced_carve(tss_reduced *s, tss__n_slab *b) {
-    size_t r = (size_t)s->r, n = s->n;
-    double **small[6] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new};
-    double **large[4] = {&s->x, &s->x_last, &s->q, &s->force};
-    for (int k = 0; k < 6; k++) *small[k] = tss__n_take(b, 1, r);
-    for (int k = 0; k < 4; k++) *large[k] = tss__n_take(b, 1, n);
-    s->S = tss__n_take(b, s->def.memory, r), s->Y = tss__n_take(b, s->def.memory, r);
-    s->curve = tss__n_take(b, s->def.memory, 1), s->part = tss__n_take(b, s->def.memory, 1);
+    const tss_net *net = s->def.decoder;
+    size_t r = (size_t)s->r, n = s->n, m = s->m, M = (size_t)s->def.memory;
+    size_t cols = 1 + (size_t)s->k_most, H = s->k_most ? r : 0, tape = net->off[s->top + 1];
+    size_t x_cols = 1 + (s->def.solver == TSS_PROJECTED_NEWTON ? r : 0);
+    double **of_r[] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new, &s->lambda};
+    double **of_n[] = {&s->mass,      &s->force,     &s->c,        &s->x,
+                       &s->held[0].x, &s->held[1].x, &s->held[2].x};
+    double **of_m[] = {&s->phi, &s->phi_last, &s->phi_bar, &s->w, &s->u, &s->gap, &s->force_phi};
+    for (int k = 0; k < 7; k++) *of_r[k] = tss__n_take(b, 1, r);
+    for (int k = 0; k < 7; k++) *of_n[k] = tss__n_take(b, 1, n);
+    for (int k = 0; k < 7; k++) *of_m[k] = tss__n_take(b, 1, m);
+    s->S = tss__n_take(b, (double)M, r), s->Y = tss__n_take(b, (double)M, r);
+    s->curve = tss__n_take(b, 1, M), s->part = tss__n_take(b, 1, M);
+    s->H = tss__n_take(b, (double)H, H), s->V = tss__n_take(b, (double)H, H);
+    s->B = tss__n_take(b, (double)n, m), s->c_rows = tss__n_take(b, 1, s->rows);
+    s->G = tss__n_take(b, (double)m, m), s->G_free = tss__n_take(b, (double)m, m);
+    s->B_rows = tss__n_take(b, (double)m, s->rows);
+    s->near_weight = tss__n_take(b, 1, (size_t)s->contacts);
+    s->tape = tss__n_take(b, (double)cols, tape), s->mid = tss__n_take(b, (double)cols, tape);
+    s->slope = tss__n_take(b, 2, tape);
+    s->bar = tss__n_take(b, (double)cols, (size_t)net->widest);
+    s->next = tss__n_take(b, (double)cols, (size_t)net->widest);
+    s->X = tss__n_take(b, (double)x_cols, s->rows);
+    s->Xbar = tss__n_take(b, (double)x_cols, s->rows);
+    s->panel_size = s->rows > (size_t)net->widest ? s->rows : (size_t)net->widest;
+    if (cols > s->panel_size) s->panel_size = cols;
+    s->panel = tss__n_take(b, 8, s->panel_size);
+    s->scratch = tss__n_take(b, TSS__N_CELL, 3 * x_cols + 2);
 }
 
 static int tss__reduced_arrays(tss_reduced *s) {
-    tss__n_slab b = {NULL, 0, 0}, pass = {NULL, 0, 0};
+    tss__n_slab b = {NULL, 0, 0};
+    if (!tss__reduced_ints(s)) return 0;
     tss__reduced_carve(s, &b);
-    if (b.want >= 1e15 || tss_work_create(&s->host, &s->work) != TSS_OK) return 0;
+    if (b.want >= 1e15) return 0;
     s->bytes = b.used * sizeof(double);
     s->p = (double *)tss_alloc(&s->host, s->bytes);
     if (!s->p) return 0;
     tss__n_zero(s->p, b.used);
     b.base = s->p, b.used = 0;
     tss__reduced_carve(s, &b);
-    tss__reduced_init(&s->job, s->def.decoder, s->def.elements, TSS__CELL_REVERSE, 1, 0, NULL);
-    s->job.p.dof = NULL, s->job.p.coords = s->n;
-    tss__reduced_plan(&s->job, &pass, 0);
-    if (!tss__n_room(s->work, &pass)) return 0;
-    tss__reduced_plan(&s->job, &pass, 0);
     return 1;
+}
+
+// ---- the affine end of the decoder ----------------------------------------------------------
+
+// Sums with a fixed order that the compiler can keep in registers of eight.
+static double tss__n_dot8(size_t n, const double *a, const double *b) {
+    double acc[8] = {0}, s = 0;
+    size_t i = 0;
+    for (; i + 8 <= n; i += 8)
+        for (size_t c = 0; c < 8; c++) acc[c] += a[i + c] * b[i + c];
+    for (; i < n; i++) s += a[i] * b[i];
+    return s + (((acc[0] + acc[4]) + (acc[2] + acc[6])) + ((acc[1] + acc[5]) + (acc[3] + acc[7])));
+}
+
+static void tss__n_axpy(size_t n, double f, const double *x, double *y) {
+    for (size_t i = 0; i < n; i++) y[i] += f * x[i];
+}
+
+// y += Σ f_a x_a over `count` rows of x, four at a time: y is read and written less often.
+static void tss__n_combine(size_t n, size_t count, const double *f, const double *x, double *y) {
+    size_t a = 0;
+    for (; a + 4 <= count; a += 4) {
+        const double *p = x + a * n, *q = p + n, *r = q + n, *s = r + n;
+        double e = f[a], g = f[a + 1], h = f[a + 2], k = f[a + 3];
+        for (size_t i = 0; i < n; i++) y[i] += (e * p[i] + g * q[i]) + (h * r[i] + k * s[i]);
+    }
+    for (; a < count; a++) tss__n_axpy(n, f[a], x + a * n, y);
+}
+
+// c and B, row by row.
+static void tss__reduced_affine(tss_reduced *s) {
+    const tss_net *net = s->def.decoder;
+    size_t m = s->m, last = (size_t)net->width[net->layers];
+    const double *W = net->par + net->theta[net->layers - 1], *b = W + m * last;
+    for (size_t i = 0; i < s->n; i++) {
+        double *row = s->B + i * m, f = net->map == TSS__MAP_SCATTER ? net->scale : 1;
+        int from = net->map == TSS__MAP_SCATTER ? net->from[i] : (int)i;
+        s->c[i] = net->map ? net->out_base[i] : 0;
+        if (net->map == TSS__MAP_MATRIX && s->top == net->layers) {
+            memcpy(row, net->out_matrix + i * m, m * sizeof(double));
+        } else if (net->map == TSS__MAP_MATRIX) {
+            const double *out = net->out_matrix + i * last;
+            for (size_t k = 0; k < m; k++) row[k] = tss__n_dot8(last, W + k * last, out);
+            s->c[i] += tss__n_dot8(last, b, out);
+        } else if (from >= 0) {
+            for (size_t k = 0; k < m; k++) row[k] = f * W[k * last + (size_t)from];
+            s->c[i] += f * b[from];
+        }
+    }
+    for (size_t q = 0; q < s->rows; q++) {
+        size_t d = (size_t)s->dim, i = (size_t)s->row_node[q / d] * d + q % d;
+        s->c_rows[q] = s->c[i];
+        for (size_t k = 0; k < m; k++) s->B_rows[k * s->rows + q] = s->B[i * m + k];
+    }
+}
+
+// G += f b bᵀ for the row b of coordinate i.
+static void tss__reduced_rank_one(const tss_reduced *s, double f, size_t i, double *G) {
+    const double *b = s->B + i * s->m;
+    for (size_t a = 0; f != 0 && a < s->m; a++) tss__n_axpy(s->m, f * b[a], b, G + a * s->m);
+}
+
+static double tss__reduced_at(const tss_reduced *s, size_t i, const double *phi) {
+    return s->c[i] + tss__n_dot8(s->m, s->B + i * s->m, phi);
+}
+
+static void tss__reduced_fill(tss_reduced *s) {
+    for (size_t i = 0; i < s->n; i++) s->mass[i] = s->def.mass ? s->def.mass[i] : 1;
+    for (int i = 0; i < s->contacts; i++)
+        s->near_weight[i] = s->def.contact_weight ? s->def.contact_weight[i] : 1;
+    tss__reduced_affine(s);
+    for (size_t i = 0; i < s->n; i++) tss__reduced_rank_one(s, s->mass[i], i, s->G);
+    memcpy(s->G_free, s->G, s->m * s->m * sizeof(double));
+}
+
+// elements NULL: for projection alone.
+static tss_result tss__reduced_make(const tss_host *host, const tss_reduced_def *def, int dim,
+                                    tss_reduced **out) {
+    const tss_net *net = def->decoder;
+    tss_reduced *s = (tss_reduced *)tss_alloc(host, sizeof *s);
+    if (!s) return TSS_ERROR_NO_MEMORY;
+    memset(s, 0, sizeof *s);
+    s->host = *host, s->def = *def, s->r = net->inputs, s->n = (size_t)net->outputs, s->dim = dim;
+    s->nodes = net->outputs / dim;
+    s->top = net->layers - 1;
+    if (net->map == TSS__MAP_MATRIX && net->width[net->layers] < net->width[s->top])
+        s->top = net->layers;
+    s->m = (size_t)net->width[s->top];
+    s->k_most = s->r <= TSS__REDUCED_DENSE ? s->r : 0;
+    if (def->sdf) s->contacts = def->contact_node ? def->contact_count : s->nodes;
+    if (!tss__reduced_arrays(s)) {
+        tss_reduced_destroy(s);
+        return TSS_ERROR_NO_MEMORY;
+    }
+    tss__reduced_fill(s);
+    if (tss_reduced_set(s, def->start ? def->start : s->z) != TSS_OK) {
+        tss_reduced_destroy(s);
+        return tss__n_refuse(host, TSS_ERROR_BAD_ARGUMENT, "reduced solver: start is not finite");
+    }
+    *out = s;
+    return TSS_OK;
 }
 
 tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def, tss_reduced **out) {
     tss_host h = host ? *host : tss_host_default();
     *out = NULL;
     TSS_ASSERT(def->cookie == TSS__REDUCED_COOKIE && "tss_reduced_def: start from the default");
+    if (!def->decoder || !def->elements || !tss__n_fits(def->decoder, def->elements))
+        return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT,
+                             "reduced solver: decoder and elements do not fit each other");
     const char *wrong = tss__reduced_complaint(def);
+    if (!wrong) wrong = tss__contact_complaint(def, def->elements->nodes);
     if (wrong) return tss__n_refuse(&h, TSS_ERROR_BAD_ARGUMENT, wrong);
-    tss_reduced *s = (tss_reduced *)tss_alloc(&h, sizeof *s);
-    if (!s) return TSS_ERROR_NO_MEMORY;
-    memset(s, 0, sizeof *s);
-    s->host = h, s->def = *def, s->r = def->decoder->inputs, s->n = (size_t)def->decoder->outputs;
-    if (!tss__reduced_arrays(s)) {
-        tss_reduced_destroy(s);
-        return TSS_ERROR_NO_MEMORY;
-    }
-    tss_reduced_set(s, def->start ? def->start : s->z);
-    *out = s;
-    return TSS_OK;
+    return tss__reduced_make(&h, def, def->elements->dim, out);
 }
 
-// E at z; its gradient to g, f(z) is left in the job's x.
-static double tss__reduced_energy(tss_reduced *s, const double *z, double *g) {
-    tss__n_reduced *j = &s->job;
-    const tss__jetpass *p = &j->p;
-    double P, E, half = s->def.h > 0 ? 0.5 / (s->def.h * s->def.h) : 0;
-    j->z = z, j->P = &P;
-    s->evaluations++;
-    tss__jetpass_load(p, 0, z, NULL, 0), tss__jetpass_forward(p, 0), tss__jetpass_out(p, 0);
-    tss__reduced_elements(j, 0);
-    E = P;
-    for (size_t i = 0; i < s->n; i++) {
-        double gap = p->x[i] - s->q[i], m = half > 0 ? half * s->def.mass[i] : 0;
-        E += m * gap * gap - s->force[i] * p->x[i];
-        p->xbar[i] += 2 * m * gap - s->force[i];
+// ---- one evaluation -------------------------------------------------------------------------
+
+static double *tss__reduced_layer(const tss_reduced *s, double *tape, int l) {
+    return tape + (1 + (size_t)s->k_most) * s->def.decoder->off[l];
+}
+
+// σ of layer l on all rows; its first two derivatives stay for the way back.
+static void tss__reduced_activate(tss_reduced *s, int l, int k) {
+    const tss_net *net = s->def.decoder;
+    size_t w = (size_t)net->width[l];
+    double *S = tss__reduced_layer(s, s->mid, l), *H = tss__reduced_layer(s, s->tape, l);
+    double *d1 = s->slope + 2 * net->off[l], *d2 = d1 + w;
+    for (size_t o = 0; o < w; o++) {
+        double d[4];
+        tss__n_activate(net->activation, S[o], d);
+        H[o] = d[0], d1[o] = d[1], d2[o] = d[2];
     }
-    tss__jetpass_in_bar(p, 0, p->xbar);
-    memcpy(g, tss__jetpass_backward(p, 0, 0), (size_t)s->r * sizeof(double));
+    for (size_t a = 1; a <= (size_t)k; a++)
+        for (size_t o = 0; o < w; o++) H[a * w + o] = d1[o] * S[a * w + o];
+}
+
+// φ at z and, for k > 0, its derivatives along each z_a; row a of the result is along z_{a−1}.
+static double *tss__reduced_forward(tss_reduced *s, const double *z, int k) {
+    const tss_net *net = s->def.decoder;
+    size_t r = (size_t)s->r, K = (size_t)k;
+    double *in = tss__reduced_layer(s, s->tape, 0);
+    memcpy(in, z, r * sizeof(double));
+    if (k) tss__n_identity(in + r, k);
+    for (int l = 0; l < s->top; l++) {
+        size_t w = (size_t)net->width[l], out = (size_t)net->width[l + 1];
+        const double *W = net->par + net->theta[l], *x = tss__reduced_layer(s, s->tape, l);
+        int curved = l + 1 < net->layers;
+        double *S = tss__reduced_layer(s, curved ? s->mid : s->tape, l + 1);
+        memcpy(S, W + w * out, out * sizeof(double));
+        tss__n_combine(out, w, x, W, S);
+        tss__n_zero(S + out, K * out);
+        tss__n_product(K, out, w, tss__n_rows(x + w, w), tss__n_rows(W, out), S + out, out,
+                       s->panel);
+        if (curved) tss__reduced_activate(s, l + 1, k);
+    }
+    return tss__reduced_layer(s, s->tape, s->top);
+}
+
+// From the adjoint of φ (and its derivatives; s->bar) to the gradient and the rows of the Hessian.
+static void tss__reduced_backward(tss_reduced *s, int k, double *g, double *H) {
+    const tss_net *net = s->def.decoder;
+    size_t K = (size_t)k, r = (size_t)s->r;
+    double *bar = s->bar, *next = s->next;
+    for (int l = s->top; l > 0; l--) {
+        size_t w = (size_t)net->width[l], in = (size_t)net->width[l - 1];
+        const double *W = net->par + net->theta[l - 1], *S = tss__reduced_layer(s, s->mid, l);
+        const double *d1 = s->slope + 2 * net->off[l], *d2 = d1 + w;
+        if (l < net->layers) {
+            for (size_t a = 1; a <= K; a++)
+                for (size_t o = 0; o < w; o++)
+                    bar[a * w + o] = d1[o] * bar[a * w + o] + d2[o] * S[a * w + o] * bar[o];
+            for (size_t o = 0; o < w; o++) bar[o] *= d1[o];
+        }
+        for (size_t i = 0; i < in; i++) next[i] = tss__n_dot8(w, W + i * w, bar);
+        tss__n_zero(next + in, K * in);
+        tss__n_product(K, in, w, tss__n_rows(bar + w, w), tss__n_turned(tss__n_rows(W, w)),
+                       next + in, in, s->panel);
+        double *swap = bar;
+        bar = next, next = swap;
+    }
+    memcpy(g, bar, r * sizeof(double));
+    if (k) memcpy(H, bar + r, r * r * sizeof(double));
+}
+
+// C and its derivatives; the Hessian is k a n nᵀ.
+static double tss__reduced_contact(const tss_reduced *s, int k) {
+    int d = s->dim;
+    double C = 0;
+    for (int i = 0; i < s->contacts; i++) {
+        size_t at = (size_t)s->near[i] * (size_t)d;
+        double n[3] = {0}, f = s->def.contact_stiffness * s->near_weight[i];
+        double gap = s->def.sdf(s->def.sdf_user, s->X + at, n) - s->def.contact_margin;
+        if (isnan(gap)) return gap;
+        if (gap >= 0) continue;
+        C += 0.5 * f * gap * gap;
+        for (int a = 0; a < d; a++) s->Xbar[at + (size_t)a] += f * gap * n[a];
+        for (int q = 1; q <= k; q++) {
+            size_t row = (size_t)q * s->rows + at;
+            double along = f * tss__dot_n(d, n, s->X + row);
+            for (int a = 0; a < d; a++) s->Xbar[row + (size_t)a] += along * n[a];
+        }
+    }
+    return C;
+}
+
+// Rows of handles: where they are, or 0 (derivatives, adjoints).
+static void tss__reduced_hold(const tss_reduced *s, double *rows, int first, int k, int zero) {
+    size_t d = (size_t)s->dim, nodes = s->rows / d;
+    for (size_t q = 0; s->held[0].count && q < nodes; q++) {
+        int at = s->held[0].at[s->row_node[q]];
+        if (!at) continue;
+        for (int a = first; a <= k; a++)
+            for (size_t c = 0; c < d; c++)
+                rows[(size_t)a * s->rows + q * d + c] =
+                    zero || a ? 0 : s->held[0].x[(size_t)(at - 1) * d + c];
+    }
+}
+
+// P + C at φ; adds their adjoints to s->bar.
+static double tss__reduced_bodies(tss_reduced *s, const double *phi, int k) {
+    size_t T = s->rows, m = s->m, K = (size_t)k;
+    const tss_elements *e = s->def.elements;
+    double E = 0;
+    memcpy(s->X, s->c_rows, T * sizeof(double));
+    tss__n_combine(T, m, phi, s->B_rows, s->X);
+    tss__n_zero(s->X + T, K * T), tss__n_zero(s->Xbar, (1 + K) * T);
+    tss__n_product(K, T, m, tss__n_rows(phi + m, m), tss__n_rows(s->B_rows, T), s->X + T, T,
+                   s->panel);
+    tss__reduced_hold(s, s->X, 0, k, 0);
+    if (k == 0) {
+        E = tss__elements_gradient(e, s->cell, s->hinge, s->X, s->Xbar);
+    } else {
+        tss__n_jet t;
+        memset(&t, 0, sizeof t);
+        t.e = e, t.cell = s->cell, t.hinge = s->hinge, t.mode = TSS__CELL_TANGENT, t.k = k;
+        t.x = s->X, t.ld = T, t.bar = s->Xbar, t.scratch = s->scratch;
+        tss__jet_run(&t);
+        E = t.P;
+    }
+    if (s->contacts) E += tss__reduced_contact(s, k);
+    tss__reduced_hold(s, s->Xbar, 0, k, 1);
+    for (size_t a = 0; a < m; a++) s->bar[a] += tss__n_dot8(T, s->B_rows + a * T, s->Xbar);
+    tss__n_product(K, m, T, tss__n_rows(s->Xbar + T, T), tss__n_turned(tss__n_rows(s->B_rows, T)),
+                   s->bar + m, m, s->panel);
     return E;
+}
+
+// E at z, its gradient to g and its Hessian to H (NULL: not wanted).
+static double tss__reduced_energy(tss_reduced *s, const double *z, double *g, double *H) {
+    int k = H ? s->r : 0;
+    size_t m = s->m;
+    double *phi = tss__reduced_forward(s, z, k), E = s->offset;
+    if (H)
+        s->hessians++;
+    else
+        s->evaluations++;
+    // The quadratic: half ((φ − φ̄)ᵀ Q (φ − φ̄) − 2 w·(φ − φ̄) + constant) − u·φ.
+    for (size_t a = 0; a < m; a++) s->gap[a] = phi[a] - s->phi_bar[a];
+    tss__n_zero(s->bar, (1 + (size_t)k) * m);
+    for (size_t c = 0; s->half > 0 && c <= (size_t)k; c++) {
+        const double *v = c ? phi + c * m : s->gap;
+        for (size_t a = 0; a < m; a++)
+            s->bar[c * m + a] = 2 * s->half * tss__n_dot8(m, s->quad + a * m, v);
+    }
+    if (s->half > 0) {
+        E += 0.5 * tss__n_dot8(m, s->gap, s->bar) -
+             s->half * (2 * tss__n_dot8(m, s->w, s->gap) - s->constant);
+        for (size_t a = 0; a < m; a++) s->bar[a] -= 2 * s->half * s->w[a];
+    }
+    E -= tss__n_dot8(m, s->u, phi);
+    for (size_t a = 0; a < m; a++) s->bar[a] -= s->u[a];
+    if (!s->fit) E += tss__reduced_bodies(s, phi, k);
+    tss__reduced_backward(s, k, g, H);
+    return E;
+}
+
+// ---- state ----------------------------------------------------------------------------------
+
+static void tss__held_copy(const tss_reduced *s, const tss__n_held *from, tss__n_held *to) {
+    for (int k = 0; k < to->count; k++) to->at[to->node[k]] = 0;
+    to->count = from->count;
+    for (int k = 0; k < from->count; k++) to->at[to->node[k] = from->node[k]] = k + 1;
+    memcpy(to->x, from->x, (size_t)(from->count * s->dim) * sizeof(double));
+}
+
+// The state moves on: what is at x_t becomes x_{t−1}, φ(z) and the handles become x_t.
+static void tss__reduced_advance(tss_reduced *s) {
+    tss__n_held swap = s->held[2];
+    double *phi = s->phi_last;
+    s->held[2] = s->held[1], s->held[1] = swap;
+    s->phi_last = s->phi, s->phi = phi;
+    tss__held_copy(s, &s->held[0], &s->held[1]);
+    memcpy(s->phi, tss__reduced_forward(s, s->z, 0), s->m * sizeof(double));
+    *s->decoded = 0;
 }
 
 tss_result tss_reduced_set(tss_reduced *s, const double *z) {
@@ -3146,9 +3693,8 @@ tss_result tss_reduced_set(tss_reduced *s, const double *z) {
         if (!isfinite(z[i])) return TSS_ERROR_BAD_STATE;
     if (z != s->z) memcpy(s->z, z, (size_t)s->r * sizeof(double));
     memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
-    tss__reduced_energy(s, s->z, s->g);
-    memcpy(s->x, s->job.p.x, s->n * sizeof(double));
-    memcpy(s->x_last, s->x, s->n * sizeof(double));
+    tss__reduced_advance(s);
+    tss__reduced_advance(s);
     return TSS_OK;
 }
 
@@ -3157,14 +3703,115 @@ void tss_reduced_set_force(tss_reduced *s, const double *force) {
         memcpy(s->force, force, s->n * sizeof(double));
     else
         tss__n_zero(s->force, s->n);
+    tss__n_zero(s->force_phi, s->m);
+    s->force_c = 0;
+    for (size_t i = 0; i < s->n; i++) {
+        if (s->force[i] == 0) continue;
+        s->force_c += s->force[i] * s->c[i];
+        tss__n_axpy(s->m, s->force[i], s->B + i * s->m, s->force_phi);
+    }
+}
+
+static const char *tss__handles_complaint(tss_reduced *s, int count, const int *node,
+                                          const double *x) {
+    if (count < 0 || count > s->nodes || (count > 0 && (!node || !x)))
+        return "reduced solver: handles without nodes or positions, or too many";
+    s->stamp++;
+    for (int k = 0; k < count; k++) {
+        if (node[k] < 0 || node[k] >= s->nodes) return "reduced solver: a handle is out of range";
+        if (s->seen[node[k]] == s->stamp) return "reduced solver: a handle is named twice";
+        s->seen[node[k]] = s->stamp;
+    }
+    for (int i = 0; i < count * s->dim; i++)
+        if (!isfinite(x[i])) return "reduced solver: a handle's position is not finite";
+    return NULL;
+}
+
+tss_result tss_reduced_set_handles(tss_reduced *s, int count, const int *node, const double *x) {
+    const char *wrong = tss__handles_complaint(s, count, node, x);
+    if (wrong) return tss__n_refuse(&s->host, TSS_ERROR_BAD_ARGUMENT, wrong);
+    tss__n_held *h = &s->held[0];
+    size_t d = (size_t)s->dim;
+    int same = count == h->count;
+    for (int k = 0; same && k < count; k++) same = node[k] == h->node[k];
+    if (count) memcpy(h->x, x, (size_t)count * d * sizeof(double));
+    if (same) return TSS_OK;
+    for (int k = 0; k < h->count; k++) h->at[h->node[k]] = 0;
+    memcpy(s->G_free, s->G, s->m * s->m * sizeof(double));
+    for (int k = 0; k < count; k++) {
+        h->node[k] = node[k], h->at[node[k]] = k + 1;
+        for (size_t a = 0; a < d; a++) {
+            size_t i = (size_t)node[k] * d + a;
+            tss__reduced_rank_one(s, -s->mass[i], i, s->G_free);
+        }
+    }
+    h->count = count;
+    return TSS_OK;
 }
 
 const double *tss_reduced_z(const tss_reduced *s) { return s->z; }
-const double *tss_reduced_x(const tss_reduced *s) { return s->x; }
 const uint64_t *tss_reduced_exits(const tss_reduced *s) { return s->exits; }
 
+const double *tss_reduced_x(const tss_reduced *s) {
+    if (*s->decoded) return s->x;
+    const tss__n_held *h = &s->held[1];
+    size_t wide = (size_t)s->dim;
+    for (size_t i = 0; i < s->n; i++) s->x[i] = tss__reduced_at(s, i, s->phi);
+    for (int k = 0; k < h->count; k++)
+        memcpy(s->x + (size_t)h->node[k] * wide, h->x + (size_t)k * wide, wide * sizeof(double));
+    *s->decoded = 1;
+    return s->x;
+}
+
+// Coordinate a of a node in a past state.
+static double tss__held_x(const tss_reduced *s, const tss__n_held *h, const double *phi, int node,
+                          int a) {
+    size_t i = (size_t)(node * s->dim + a);
+    int at = h->at[node];
+    return at ? h->x[(size_t)(at - 1) * (size_t)s->dim + (size_t)a] : tss__reduced_at(s, i, phi);
+}
+
+// What one node that was, or is, held does to the quadratic and the forces.
+static void tss__reduced_odd_node(tss_reduced *s, int node) {
+    for (int a = 0; a < s->dim; a++) {
+        size_t i = (size_t)(node * s->dim + a);
+        const double *b = s->B + i * s->m;
+        double q = 2 * tss__held_x(s, &s->held[1], s->phi, node, a) -
+                   tss__held_x(s, &s->held[2], s->phi_last, node, a);
+        int at = s->held[0].at[node];
+        if (at) {
+            double x = s->held[0].x[(size_t)(at - 1) * (size_t)s->dim + (size_t)a];
+            s->constant += s->mass[i] * (x - q) * (x - q);
+            s->offset -= s->force[i] * (x - s->c[i]);
+            tss__n_axpy(s->m, -s->force[i], b, s->u);
+        } else {
+            double off = q - tss__reduced_at(s, i, s->phi_bar);
+            s->constant += s->mass[i] * off * off;
+            tss__n_axpy(s->m, s->mass[i] * off, b, s->w);
+        }
+    }
+}
+
+// Sets up E of the step to come.
+static void tss__reduced_prepare(tss_reduced *s) {
+    s->fit = 0, s->half = s->def.h > 0 ? 0.5 / (s->def.h * s->def.h) : 0, s->quad = s->G_free;
+    s->constant = 0, s->offset = -s->force_c;
+    for (size_t a = 0; a < s->m; a++) s->phi_bar[a] = 2 * s->phi[a] - s->phi_last[a];
+    memcpy(s->u, s->force_phi, s->m * sizeof(double));
+    tss__n_zero(s->w, s->m);
+    const tss__n_held *h = s->held;
+    for (int k = 0; k < h[0].count; k++) tss__reduced_odd_node(s, h[0].node[k]);
+    for (int k = 0; k < h[1].count; k++)
+        if (!h[0].at[h[1].node[k]]) tss__reduced_odd_node(s, h[1].node[k]);
+    for (int k = 0; k < h[2].count; k++)
+        if (!h[0].at[h[2].node[k]] && !h[1].at[h[2].node[k]])
+            tss__reduced_odd_node(s, h[2].node[k]);
+}
+
+// ---- directions -----------------------------------------------------------------------------
+
 // d = −H g by the two loops over the history (Nocedal and Wright, algorithm 7.4).
-static void tss__reduced_direction(tss_reduced *s) {
+static void tss__reduced_lbfgs(tss_reduced *s) {
     int r = s->r, M = s->def.memory;
     for (int i = 0; i < r; i++) s->d[i] = -s->g[i];
     for (int k = 0; k < s->pairs; k++) {
@@ -3187,6 +3834,79 @@ static void tss__reduced_direction(tss_reduced *s) {
     }
 }
 
+// One rotation of Jacobi's method: A(p, q) to 0, V's rows p and q turn along.
+static void tss__eigen_turn(size_t r, double *A, double *V, size_t p, size_t q) {
+    double apq = A[p * r + q];
+    if (fabs(apq) <= 1e-16 * sqrt(fabs(A[p * r + p] * A[q * r + q])) || apq == 0) {
+        return;
+    }
+    double tau = (A[q * r + q] - A[p * r + p]) / (2 * apq);
+    double t = (tau >= 0 ? 1 : -1) / (fabs(tau) + sqrt(1 + tau * tau));
+    double c = 1 / sqrt(1 + t * t), n = t * c;
+    for (size_t i = 0; i < r; i++) {
+        double x = A[i * r + p], y = A[i * r + q];
+        A[i * r + p] = c * x - n * y, A[i * r + q] = n * x + c * y;
+    }
+    for (size_t i = 0; i < r; i++) {
+        double x = A[p * r + i], y = A[q * r + i];
+        A[p * r + i] = c * x - n * y, A[q * r + i] = n * x + c * y;
+        x = V[p * r + i], y = V[q * r + i];
+        V[p * r + i] = c * x - n * y, V[q * r + i] = n * x + c * y;
+    }
+}
+
+// A = Σ λ_i v_i v_iᵀ by cyclic Jacobi rotations; v_i are the rows of V, A is overwritten. Converges
+// quadratically; 30 sweeps are never needed.
+static void tss__eigen(int r_, double *A, double *V, double *lambda) {
+    size_t r = (size_t)r_;
+    tss__n_identity(V, r_);
+    for (int sweep = 0; sweep < 30; sweep++) {
+        double off = 0, all = 0;
+        for (size_t p = 0; p < r; p++)
+            for (size_t q = 0; q < r; q++) {
+                double a = A[p * r + q] * A[p * r + q];
+                all += a, off += p == q ? 0 : a;
+            }
+        if (!(off > 1e-30 * all)) break;
+        for (size_t p = 0; p + 1 < r; p++)
+            for (size_t q = p + 1; q < r; q++) tss__eigen_turn(r, A, V, p, q);
+    }
+    for (size_t p = 0; p < r; p++) lambda[p] = A[p * r + p];
+}
+
+// d = −(H₊ + shift)⁻¹ g, H₊ without negative eigenvalues. In a fit the shift is relative.
+static void tss__reduced_newton(tss_reduced *s) {
+    int r = s->r;
+    double most = 0, shift = s->def.shift;
+    tss__reduced_energy(s, s->z, s->g_new, s->H);
+    for (int a = 0; a < r; a++)
+        for (int b = 0; b < a; b++)
+            s->H[a * r + b] = s->H[b * r + a] = 0.5 * (s->H[a * r + b] + s->H[b * r + a]);
+    tss__eigen(r, s->H, s->V, s->lambda);
+    for (int a = 0; a < r; a++) most = s->lambda[a] > most ? s->lambda[a] : most;
+    if (s->fit) shift = 1e-12 * most + 1e-300;
+    tss__n_zero(s->d, (size_t)r);
+    for (int a = 0; a < r; a++) {
+        const double *v = s->V + a * r;
+        double l = (s->lambda[a] > 0 ? s->lambda[a] : 0) + shift;
+        tss__n_axpy((size_t)r, -tss__dot_n(r, v, s->g) / l, v, s->d);
+    }
+}
+
+// The next direction. Returns its slope, negative unless there is none.
+static double tss__reduced_direction(tss_reduced *s) {
+    int newton = s->fit ? s->k_most > 0 : s->def.solver == TSS_PROJECTED_NEWTON;
+    if (newton)
+        tss__reduced_newton(s);
+    else
+        tss__reduced_lbfgs(s);
+    double slope = tss__dot_n(s->r, s->g, s->d);
+    if (slope < 0 || newton) return slope;
+    s->pairs = 0;
+    tss__reduced_lbfgs(s);
+    return tss__dot_n(s->r, s->g, s->d);
+}
+
 // Keeps the pair of the step z → z_new if its curvature is safely positive.
 static void tss__reduced_learn(tss_reduced *s) {
     int r = s->r, M = s->def.memory, at = (s->newest + 1) % M;
@@ -3202,11 +3922,11 @@ static void tss__reduced_learn(tss_reduced *s) {
 // Backtracking (c1 = 1e-4, factor 0.8, as the paper's code) along d. 1: z_new, g_new, *E are
 // better. Where E itself is rounding, the slope decides (Hager and Zhang's approximate condition,
 // the same on a parabola).
-static int tss__reduced_line(tss_reduced *s, double *E) {
-    double t = 1, slope = tss__dot_n(s->r, s->g, s->d);
+static int tss__reduced_line(tss_reduced *s, double slope, double *E) {
+    double t = 1;
     for (int k = 0; k < s->def.max_line; k++, t *= 0.8) {
         for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
-        *E = tss__reduced_energy(s, s->z_new, s->g_new);
+        *E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
         if (!isfinite(*E)) continue;
         if (*E <= s->energy + 1e-4 * t * slope) return 1;
         if (*E <= s->energy + 1e-13 * fabs(s->energy) &&
@@ -3226,44 +3946,96 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
     size_t wide = (size_t)s->r * sizeof(double);
     s->pairs = 0, s->newest = 0;
     for (*iterations = 0;; ++*iterations) {
-        double E;
-        if (tss__n_largest(s->g, s->r) <= s->def.eps) return TSS_EXIT_CONVERGED;
+        double E, eps = s->fit ? 0 : s->def.eps;
+        if (tss__n_largest(s->g, s->r) <= eps) return TSS_EXIT_CONVERGED;
         if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
-        tss__reduced_direction(s);
-        if (!(tss__dot_n(s->r, s->g, s->d) < 0)) s->pairs = 0, tss__reduced_direction(s);
-        if (!tss__reduced_line(s, &E)) {
-            s->current = 0;
-            return TSS_EXIT_LINE_SEARCH;
-        }
+        double slope = tss__reduced_direction(s);
+        // −slope is the squared length in ‖·‖_M by which f would move.
+        if (s->fit && -slope <= 1e-20 * s->scale) return TSS_EXIT_CONVERGED;
+        if (!tss__reduced_line(s, slope, &E)) return TSS_EXIT_LINE_SEARCH;
         double fall = s->energy - E;
         tss__reduced_learn(s);
         memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
-        s->energy = E, s->current = 1;
-        if (tss__n_largest(s->g, s->r) <= s->def.eps) continue;  // counted as converged
-        if (s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) return TSS_EXIT_SADDLE;
+        s->energy = E;
+        if (tss__n_largest(s->g, s->r) <= eps) continue;  // counted as converged
+        if (!s->fit && s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) return TSS_EXIT_SADDLE;
     }
 }
 
-tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
-    size_t wide = (size_t)s->r * sizeof(double), long_ = s->n * sizeof(double);
+// ---- steps ----------------------------------------------------------------------------------
+
+static tss_reduced_info tss__reduced_solve(tss_reduced *s) {
     tss_reduced_info info;
     memset(&info, 0, sizeof info);
-    s->evaluations = 0;
-    for (size_t i = 0; i < s->n; i++) s->q[i] = 2 * s->x[i] - s->x_last[i];
-    for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
-    memcpy(s->z_last, s->z, wide), memcpy(s->x_last, s->x, long_);
-    s->energy = tss__reduced_energy(s, s->z, s->g);
-    double E = tss__reduced_energy(s, s->z_new, s->g_new);
-    s->current = E < s->energy;
-    if (s->current) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
     info.exit = tss__reduced_minimise(s, &info.iterations);
-    if (!s->current) tss__reduced_energy(s, s->z, s->g_new);  // the last trial was not taken
     info.energy = s->energy, info.gradient = tss__n_largest(s->g, s->r);
-    memcpy(s->x, s->job.p.x, long_);
-    info.evaluations = s->evaluations;
+    info.evaluations = s->evaluations, info.hessians = s->hessians;
+    return info;
+}
+
+tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
+    size_t wide = (size_t)s->r * sizeof(double);
+    s->evaluations = s->hessians = 0;
+    tss__reduced_prepare(s);
+    for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
+    memcpy(s->z_last, s->z, wide);
+    s->energy = tss__reduced_energy(s, s->z, s->g, NULL);
+    double E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
+    if (E < s->energy) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
+    tss_reduced_info info = tss__reduced_solve(s);
+    tss__reduced_advance(s);
     s->exits[info.exit]++;
     if (out) *out = info;
     return TSS_OK;
+}
+
+// Σ m |x_i − mean|²: the squared size of x in ‖·‖_M.
+static double tss__reduced_size(const tss_reduced *s, const double *x) {
+    double all = 0;
+    for (size_t a = 0, d = (size_t)s->dim; a < d; a++) {
+        double mean = 0;
+        for (size_t i = a; i < s->n; i += d) mean += x[i] / s->nodes;
+        for (size_t i = a; i < s->n; i += d) all += s->mass[i] * (x[i] - mean) * (x[i] - mean);
+    }
+    return all;
+}
+
+tss_result tss_reduced_project(tss_reduced *s, const double *x, tss_reduced_info *out) {
+    for (size_t i = 0; i < s->n; i++)
+        if (!isfinite(x[i]))
+            return tss__n_refuse(&s->host, TSS_ERROR_BAD_ARGUMENT,
+                                 "reduced solver: a position to project is not finite");
+    // ½‖c + Bφ − x‖² about the φ that it starts from.
+    s->evaluations = s->hessians = 0;
+    s->fit = 1, s->half = 0.5, s->quad = s->G, s->constant = s->offset = 0;
+    s->scale = tss__reduced_size(s, x);
+    memcpy(s->phi_bar, tss__reduced_forward(s, s->z, 0), s->m * sizeof(double));
+    tss__n_zero(s->u, s->m), tss__n_zero(s->w, s->m);
+    for (size_t i = 0; i < s->n; i++) {
+        double gap = x[i] - tss__reduced_at(s, i, s->phi_bar);
+        s->constant += s->mass[i] * gap * gap;
+        tss__n_axpy(s->m, s->mass[i] * gap, s->B + i * s->m, s->w);
+    }
+    s->energy = tss__reduced_energy(s, s->z, s->g, NULL);
+    tss_reduced_info info = tss__reduced_solve(s);
+    if (out) *out = info;
+    return tss_reduced_set(s, s->z);
+}
+
+double tss_sdf_ball(void *ball, const double *x, double *n) {
+    const tss_ball *b = (const tss_ball *)ball;
+    double l = 0;
+    for (int a = 0; a < b->dim; a++) n[a] = x[a] - b->center[a], l += n[a] * n[a];
+    l = sqrt(l);
+    for (int a = 0; a < b->dim; a++) n[a] = l > 0 ? n[a] / l : a == 0;  // in the centre: any
+    return l - b->radius;
+}
+
+double tss_sdf_halfspace(void *halfspace, const double *x, double *n) {
+    const tss_halfspace *h = (const tss_halfspace *)halfspace;
+    double s = 0;
+    for (int a = 0; a < h->dim; a++) n[a] = h->normal[a], s += n[a] * (x[a] - h->point[a]);
+    return s;
 }
 
 #ifdef __cplusplus

@@ -157,7 +157,7 @@ compat() {
 
 sanitize() {
     # shellcheck disable=SC2086
-    variant asan "-fsanitize=address,undefined -fno-sanitize-recover=undefined $none" $core_tests test_elastic test_neural
+    variant asan "-fsanitize=address,undefined -fno-sanitize-recover=undefined $none" $core_tests test_elastic test_neural test_reduced
     variant tsan "-fsanitize=thread -DTSS_NO_OPENMP -DTSS_NO_LAPACK -DTSS_NO_METIS -DTSS_NO_SIMD" test_threads
 }
 

@@ -1433,7 +1433,7 @@ static void test_reduced_exits(void **state) {
         for (allowance = 0; tss_reduced_create(&h, &d, &sim) == TSS_ERROR_NO_MEMORY;
              allowance = ++limit)
             assert_int_equal(held, 0);
-        assert_true(sim && limit >= 3);
+        assert_true(sim && limit >= 2);
         tss_reduced_set_force(sim, force);
         allowance = 0;
         assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
@@ -1446,7 +1446,8 @@ static void test_reduced_exits(void **state) {
                 z[i] = tss_reduced_z(sim)[i] + (i == kind % R ? 1e-3 * side : 0);
             tss_net_forward(n, s.work, 1, z, x);
             E[side + 1] = tss_elements_potential(s.e, x, NULL);
-            if (side == 0) assert_memory_equal(x, tss_reduced_x(sim), (size_t)s.coords * sizeof *x);
+            for (int i = 0; side == 0 && i < s.coords; i++)
+                assert_true(fabs(x[i] - tss_reduced_x(sim)[i]) < 1e-14);
             double x0[200];
             tss_net_forward(n, s.work, 1, start, x0);
             for (int i = 0; i < s.coords; i++)
