@@ -887,7 +887,8 @@ static int neural_train_loop(neural_trainer *t) {
 static int neural_train_phase(neural *v, neural_phase phase) {
     neural_trainer t;
     int ok = neural_trainer_open(v, phase, &t) && neural_train_loop(&t);
-    if (ok) printf("%s: step %llu, %.1f s, loss %.6g, Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds, t.loss, t.lip);
+    if (ok && t.loss > 0)
+        printf("%s: step %llu, %.1f s, loss %.6g, Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds, t.loss, t.lip);
     fflush(stdout);
     neural_trainer_close(&t);
     return ok;
@@ -909,9 +910,451 @@ static int neural_train(neural *v) {
     return ok;
 }
 
+// ---------------------------------------------------------------------------------------------
+// >>neural_trial: the test sequences in full space and in the subspaces, side by side
+// ---------------------------------------------------------------------------------------------
+
+enum { NEURAL_TRIAL_VANILLA, NEURAL_TRIAL_LIPSCHITZ, NEURAL_TRIAL_LINEAR, NEURAL_TRIAL_FULL, NEURAL_TRIALS };
+static const char *const neural_trial_names[] = {"vanilla", "lipschitz", "linear", "full"};
+
+typedef struct neural_entry {
+    int used;
+    tss_model m;
+    tss_reduced *s;
+    // Of each step of the tests: s (the shortest of --repeat), counts, exit, and what remains of the
+    // gradient, J; distance from full space over the diagonal, of all nodes and the farthest.
+    double *seconds, *gradient, *energy, *mean, *farthest;
+    int *iterations, *evaluations, *exit;
+    // Distance of the tests' states from the nearest that the decoder reaches, over the diagonal.
+    double projection_mean, projection_farthest;
+    double lip, z_scale, train_seconds;
+} neural_entry;
+
+typedef struct neural_trial {
+    neural *v;
+    neural_entry e[NEURAL_TRIALS];
+    int steps;
+    double diagonal, *room, *force, *target;
+} neural_trial;
+
+// The best r modes of the frames.
+static int neural_linear(neural *v, tss_model *m) {
+    int r = v->d->r, width[2] = {r, r};
+    double *B = (double *)need((size_t)v->n * (size_t)r, sizeof *B);
+    tss_net_def d = tss_net_def_default();
+    for (int j = 0; j < v->n; j++)
+        for (int k = 0; k < r; k++) B[j * r + k] = v->B[(size_t)j * (size_t)v->p + (size_t)k];
+    d.layers = 1, d.width = width, d.outputs = v->n, d.out_base = v->x0, d.out_matrix = B;
+    tss_result e = tss_net_create(NULL, &d, &m->decoder);
+    free(B);
+    if (e != TSS_OK) return fail(v->r, "out of memory");
+    double *theta = tss_net_parameters(m->decoder);
+    for (int i = 0; i < r * r + r; i++) theta[i] = i < r * r && i % (r + 1) == 0;
+    return 1;
+}
+
+static int neural_entry_open(neural_trial *t, int which) {
+    neural *v = t->v;
+    neural_entry *e = &t->e[which];
+    const scene_neural *d = v->d;
+    size_t steps = (size_t)t->steps;
+    int there = 1;
+    e->seconds = (double *)need(5 * steps, sizeof(double)), e->gradient = e->seconds + steps;
+    e->energy = e->gradient + steps, e->mean = e->energy + steps, e->farthest = e->mean + steps;
+    e->iterations = (int *)need(3 * steps, sizeof(int)), e->evaluations = e->iterations + steps, e->exit = e->evaluations + steps;
+    for (size_t k = 0; k < steps; k++) e->seconds[k] = INFINITY;
+    if (which == NEURAL_TRIAL_FULL) return e->used = 1;
+    if (which == NEURAL_TRIAL_LINEAR && d->unsupervised) return 1;
+    neural_phase phase = which == NEURAL_TRIAL_VANILLA ? NEURAL_VANILLA : NEURAL_LIPSCHITZ;
+    if (which == NEURAL_TRIAL_LINEAR ? !neural_linear(v, &e->m) : !neural_read(v, phase, &e->m, &there)) return 0;
+    if (!there)
+        return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
+                    v->r->o.seed, v->r->o.scene);
+    tss_reduced_def rd = tss_reduced_def_default();
+    rd.decoder = e->m.decoder, rd.elements = v->elements, rd.mass = v->mass, rd.h = v->h;
+    rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
+    rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+    tss_host host = tss_host_default();
+    host.log = print_log, host.workers = v->r->o.threads;
+    e->used = 1;
+    if (which != NEURAL_TRIAL_LINEAR)
+        e->train_seconds = neural_spent(v, NEURAL_BASE, (uint64_t)d->train.steps) + neural_spent(v, phase, e->m.step);
+    return tss_reduced_create(&host, &rd, &e->s) == TSS_OK ? 1 : fail(v->r, "%s: neural.solver is refused", v->r->o.scene);
+}
+
+static int neural_trial_open(neural *v, neural_trial *t) {
+    double lo[3], hi[3];
+    memset(t, 0, sizeof *t);
+    t->v = v;
+    if (!neural_frames(v)) return 0;
+    if (v->stopped) return fail(v->r, "%s/frames.bin: not all frames are there yet", v->r->o.out);
+    if (!v->d->unsupervised && !neural_basis(v)) return 0;
+    t->steps = v->d->script.test * (v->d->script.length / v->d->script.stride);
+    if (v->d->script.stride > v->d->script.length || (v->h > 0 && v->d->script.stride > 1))
+        return fail(v->r, "%s: neural.script.stride is %d, expected at most length (%d), and 1 unless quasi-static", v->r->o.scene,
+                    v->d->script.stride, v->d->script.length);
+    t->room = (double *)need(3 * (size_t)v->n, sizeof(double)), t->force = t->room + v->n, t->target = t->force + v->n;
+    scene__box_empty(lo, hi);
+    for (int i = 0; i < v->n; i++)
+        lo[i % v->dim] = fmin(lo[i % v->dim], v->X[i]), hi[i % v->dim] = fmax(hi[i % v->dim], v->X[i]);
+    for (int c = 0; c < v->dim; c++) t->diagonal += (hi[c] - lo[c]) * (hi[c] - lo[c]);
+    t->diagonal = sqrt(t->diagonal);
+    for (int k = 0; k < NEURAL_TRIALS; k++)
+        if (!neural_entry_open(t, k)) return 0;
+    return 1;
+}
+
+static void neural_trial_close(neural_trial *t) {
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m);
+        free(t->e[k].seconds), free(t->e[k].iterations);
+    }
+    free(t->room);
+}
+
+// ‖x − y‖ of the nodes over the diagonal: the mean, and the farthest.
+static void neural_distance(const neural_trial *t, const double *x, const double *y, double *mean, double *farthest_) {
+    const neural *v = t->v;
+    *mean = *farthest_ = 0;
+    for (int i = 0; i < v->nodes; i++) {
+        double s = 0;
+        for (int j = v->dim * i; j < v->dim * (i + 1); j++) s += (x[j] - y[j]) * (x[j] - y[j]);
+        *mean += sqrt(s) / (v->nodes * t->diagonal), *farthest_ = fmax(*farthest_, sqrt(s) / t->diagonal);
+    }
+}
+
+// Step k of a sequence by one subspace; `at`: of all test steps. Seconds include decoding.
+static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
+    neural *v = t->v;
+    tss_reduced_info i;
+    double began = now(NULL);
+    tss_result r = tss_reduced_set_handles(e->s, v->handles, v->handle, t->target);
+    tss_reduced_set_force(e->s, t->force);
+    if (r == TSS_OK) r = tss_reduced_step(e->s, &i);
+    if (r != TSS_OK) return fail(v->r, "%s: test step %d: %s", v->r->o.scene, at + 1, tss_result_text(r));
+    const double *x = tss_reduced_x(e->s);
+    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began);
+    e->iterations[at] = i.iterations, e->evaluations[at] = i.evaluations, e->exit[at] = (int)i.exit;
+    e->gradient[at] = i.gradient, e->energy[at] = i.energy;
+    neural_distance(t, x, tss_world_positions(v->r->w), &e->mean[at], &e->farthest[at]);
+    return 1;
+}
+
+// Full space takes the script's steps one by one, up to and with step k.
+static int neural_trial_full(neural_trial *t, const neural_script *s, int k, int at) {
+    neural_entry *e = &t->e[NEURAL_TRIAL_FULL];
+    tss_step_info i;
+    double began = now(NULL);
+    e->iterations[at] = 0, e->exit[at] = TSS_EXIT_CONVERGED;
+    for (int q = k - t->v->d->script.stride + 1; q <= k; q++) {
+        if (!neural_full_step(t->v, s, q, t->room, &i)) return 0;
+        e->iterations[at] += i.newton;
+        if (i.status != TSS_STEP_CONVERGED) e->exit[at] = TSS_EXIT_ITERATIONS;
+    }
+    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began), e->evaluations[at] = e->iterations[at];
+    e->energy[at] = tss_elements_potential(t->v->elements, tss_world_positions(t->v->r->w), NULL);
+    return 1;
+}
+
+typedef int neural_watch(neural_trial *t, int sequence, int k, void *ctx);  // 0: fails
+
+static int neural_trial_sequence(neural_trial *t, int number, const neural_start *start, neural_watch *watch, void *ctx) {
+    neural *v = t->v;
+    neural_script s = neural_script_of(v, number);
+    int ok = load_world(v->r, v->r->w, start->data, start->size);
+    for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {
+        if (!t->e[q].used) continue;
+        (void)tss_reduced_set_handles(t->e[q].s, 0, NULL, NULL);
+        tss_result r = tss_reduced_project(t->e[q].s, v->x0, NULL);
+        if (r != TSS_OK) ok = fail(v->r, "%s: the start cannot be projected: %s", v->r->o.scene, tss_result_text(r));
+    }
+    int stride = v->d->script.stride;
+    for (int k = stride - 1; ok && k < s.length; k += stride) {
+        int at = number * (s.length / stride) + k / stride;
+        ok = neural_trial_full(t, &s, k, at);
+        neural_targets(v, &s, k, t->target), neural_forces(v, &s, k, 1, t->force);
+        for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {  // who is first takes turns
+            neural_entry *e = &t->e[(q + at) % NEURAL_TRIAL_FULL];
+            if (e->used) ok = neural_trial_step(t, e, at);
+        }
+        if (ok && watch) ok = watch(t, number, k, ctx);
+        neural_progress(v, (at + 1.0) / t->steps, "test step %d of %d", at + 1, t->steps);
+    }
+    neural_script_free(&s);
+    return ok;
+}
+
+static int neural_trial_run(neural_trial *t, neural_watch *watch, void *ctx) {
+    neural_start start;
+    int ok = 1;
+    start.data = save_world(t->v->r->w, &start.size);
+    for (int pass = 0; ok && pass < t->v->r->o.repeat; pass++)
+        for (int q = 0; ok && q < t->v->d->script.test; q++)
+            ok = neural_trial_sequence(t, q, &start, pass == 0 ? watch : NULL, ctx);
+    free(start.data);
+    return ok;
+}
+
+static double neural_mean(const double *v, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s += v[i] / n;
+    return s;
+}
+static double neural_mean_of(const int *v, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s += (double)v[i] / n;
+    return s;
+}
+static double neural_most(const double *v, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s = fmax(s, v[i]);
+    return s;
+}
+static int neural_exits(const neural_entry *e, int n, tss_exit x) {
+    int s = 0;
+    for (int i = 0; i < n; i++) s += e->exit[i] == (int)x;
+    return s;
+}
+
+static void neural_table(const neural_trial *t) {
+    printf("%-10s %9s %7s %7s %24s %10s %10s %10s %10s %10s %9s\n", "method", "ms/step", "iter.", "eval.",
+           "converged/saddle/line/it", "gradient", "energy", "error", "farthest", "projection", "Lip");
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        const neural_entry *e = &t->e[k];
+        char exits[40];
+        int n = t->steps;
+        if (!e->used) continue;
+        snprintf(exits, sizeof exits, "%d/%d/%d/%d", neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE),
+                 neural_exits(e, n, TSS_EXIT_LINE_SEARCH), neural_exits(e, n, TSS_EXIT_ITERATIONS));
+        printf("%-10s %9.3f %7.1f %7.1f %24s %10.3g %10.5g %10.3g %10.3g %10.3g %9.4g\n", neural_trial_names[k],
+               1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n), exits,
+               neural_mean(e->gradient, n), neural_mean(e->energy, n), neural_mean(e->mean, n), neural_most(e->farthest, n),
+               e->projection_mean, e->lip);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_evaluate
+// ---------------------------------------------------------------------------------------------
+
+// Every fourth state of the tests.
+static int neural_project(neural_trial *t, neural_entry *e) {
+    neural *v = t->v;
+    int count = 0;
+    (void)tss_reduced_set_handles(e->s, 0, NULL, NULL);
+    for (int f = 0; f < v->tests; f += 4, count++) {
+        double mean, most;
+        const double *x = v->test + (size_t)f * (size_t)v->n;
+        double *z = e->m.encoder ? neural_z(v, &e->m, x, 1) : NULL;
+        if (z) (void)tss_reduced_set(e->s, z);
+        free(z);
+        if (tss_reduced_project(e->s, x, NULL) != TSS_OK) return fail(v->r, "%s: test state %d cannot be projected", v->r->o.scene, f);
+        neural_distance(t, tss_reduced_x(e->s), x, &mean, &most);
+        e->projection_mean += mean, e->projection_farthest = fmax(e->projection_farthest, most);
+    }
+    e->projection_mean /= count;
+    return 1;
+}
+
+// Eq. 7 with all cells, in the unit of z and of the spread of z.
+static int neural_lip(neural_trial *t, neural_entry *e) {
+    neural *v = t->v;
+    int count = v->d->samples;
+    double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
+    if (!v->d->unsupervised && count > v->tests) count = v->tests;
+    double *z = neural_z(v, &e->m, x, count);
+    tss_result r = tss_lipschitz_estimate(e->m.decoder, v->elements, v->work, 2, count, z, &e->lip);
+    e->z_scale = neural_z_scale(z, count, v->d->r);
+    free(x), free(z);
+    return r == TSS_OK ? 1 : fail(v->r, "%s: Eq. 7: %s", v->r->o.scene, tss_result_text(r));
+}
+
+static void neural_machine(char text[160]) {
+    char line[200];
+    FILE *f = fopen("/proc/cpuinfo", "r");
+    snprintf(text, 160, "unknown processor");
+    while (f && fgets(line, sizeof line, f))
+        if (strncmp(line, "model name", 10) == 0 && strchr(line, ':')) {
+            line[strcspn(line, "\n")] = 0;
+            snprintf(text, 160, "%.150s", strchr(line, ':') + 2);
+            break;
+        }
+    if (f) fclose(f);
+}
+
+static int neural_rows(neural_trial *t) {
+    neural *v = t->v;
+    char path[700], name[120], machine[160];
+    snprintf(path, sizeof path, "%s/evaluate.csv", v->r->o.out);
+    int old = access(path, F_OK) == 0, n = t->steps;
+    FILE *f = fopen(path, "a");
+    if (!f) return fail(v->r, "%s: cannot be written: %s", path, strerror(errno));
+    neural_machine(machine);
+    fprintf(f, "# %s, threads %d, test steps %d, best of %d", machine, v->r->o.threads, n, v->r->o.repeat);
+    for (int k = 0; k < v->r->o.sets; k++) fprintf(f, "%s %s", k ? "" : ", with", v->r->o.set[k]);
+    fputc('\n', f);
+    if (!old)
+        fputs("system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,"
+              "exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,projection_max,simulation_max,"
+              "energy,z_scale,lipschitz_weight,solver\n", f);
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        const neural_entry *e = &t->e[k];
+        if (!e->used) continue;
+        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%s\n",
+                sweep_name(v->r, name), neural_trial_names[k], v->r->o.seed, v->n, v->cells, k == NEURAL_TRIAL_FULL ? v->n : v->d->r,
+                1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n),
+                neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE), neural_exits(e, n, TSS_EXIT_LINE_SEARCH),
+                neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip, e->projection_mean,
+                neural_mean(e->mean, n), e->train_seconds, e->projection_farthest, neural_most(e->farthest, n),
+                neural_mean(e->energy, n), e->z_scale, k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
+                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind]);
+    }
+    return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
+}
+
+static int neural_evaluate(neural *v) {
+    neural_trial t;
+    int ok = neural_trial_open(v, &t) && neural_trial_run(&t, NULL, NULL);
+    for (int k = 0; ok && k < NEURAL_TRIAL_FULL; k++)
+        if (t.e[k].used) ok = neural_project(&t, &t.e[k]) && (k == NEURAL_TRIAL_LINEAR || neural_lip(&t, &t.e[k]));
+    if (ok) neural_table(&t);
+    if (ok) {
+        const neural_entry *a = &t.e[NEURAL_TRIAL_VANILLA], *b = &t.e[NEURAL_TRIAL_LIPSCHITZ];
+        printf("speedup %.3f lip %.3f projection %.3f simulation %.3f (vanilla over lipschitz, the last two the other way)\n",
+               neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps), a->lip / b->lip,
+               b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
+        ok = neural_rows(&t);
+    }
+    neural_trial_close(&t);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_run: what it looks like
+// ---------------------------------------------------------------------------------------------
+
+#define NEURAL_SHOTS 4  // pictures a method
+
+typedef struct neural_album {
+    view_image shot[NEURAL_SHOTS * NEURAL_TRIAL_FULL];
+    const char *label[NEURAL_SHOTS * NEURAL_TRIAL_FULL];
+    int shots;
+    FILE *rows;
+} neural_album;
+
+static void neural_draw_state(run *r, const double *x, const float color[3]) {
+    int dim = r->s.world.dim;
+    for (int i = 0; i < tss_world_nodes(r->w); i++)
+        for (int c = 0; c < 3; c++) r->x3[3 * i + c] = c < dim ? x[dim * i + c] : 0;
+    memcpy(r->s.body[0].color, color, 3 * sizeof *color);
+    draw_body(r, 0);
+}
+
+// The subspace's state in blue over full space in purple.
+static int neural_shoot(neural_trial *t, neural_album *a) {
+    static const float blue[3] = {0.25f, 0.55f, 0.85f}, purple[3] = {0.62f, 0.40f, 0.72f};
+    run *r = t->v->r;
+    for (int q = 0; q < NEURAL_TRIAL_FULL; q++) {
+        view_look look = scene_look(r);
+        if (!t->e[q].used) continue;
+        view_begin(r->view, &r->camera, &look);
+        neural_draw_state(r, tss_world_positions(r->w), purple);
+        neural_draw_state(r, tss_reduced_x(t->e[q].s), blue);
+        view_image im = view_render(r->view);
+        if (!im.rgb) return fail(r, "out of memory for a picture");
+        a->label[a->shots] = neural_trial_names[q];
+        a->shot[a->shots++] = view_image_shrink(&im, im.width);
+    }
+    return 1;
+}
+
+static int neural_watch_step(neural_trial *t, int sequence, int k, void *ctx) {
+    neural_album *a = (neural_album *)ctx;
+    int stride = t->v->d->script.stride, tests = t->steps;
+    int at = sequence * (t->v->d->script.length / stride) + k / stride;
+    for (int q = 0; q < NEURAL_TRIALS; q++) {
+        const neural_entry *e = &t->e[q];
+        if (e->used)
+            fprintf(a->rows, "%d,%d,%s,%.6g,%d,%d,%d,%.6g,%.8g,%.6g,%.6g\n", sequence, k + 1, neural_trial_names[q], 1e3 * e->seconds[at],
+                    e->iterations[at], e->evaluations[at], e->exit[at], e->gradient[at], e->energy[at], e->mean[at], e->farthest[at]);
+    }
+    for (int s = 0; s < NEURAL_SHOTS; s++)
+        if (at == (int)((s + 0.5) * tests / NEURAL_SHOTS)) return neural_shoot(t, a);
+    return 1;
+}
+
+static double *neural_as_double(const int *v, int n) {
+    double *out = (double *)need((size_t)n, sizeof *out);
+    for (int i = 0; i < n; i++) out[i] = v[i];
+    return out;
+}
+
+static void neural_plots(report *p, neural_trial *t) {
+    report_series s[NEURAL_TRIALS], it[NEURAL_TRIALS], er[NEURAL_TRIALS];
+    int n = 0, subspaces = 0;
+    memset(s, 0, sizeof s), memset(it, 0, sizeof it), memset(er, 0, sizeof er);
+    for (int q = 0; q < NEURAL_TRIALS; q++) {
+        neural_entry *e = &t->e[q];
+        if (!e->used) continue;
+        s[n].name = it[n].name = er[n].name = neural_trial_names[q], s[n].count = it[n].count = er[n].count = t->steps;
+        s[n].y = e->seconds, it[n].y = neural_as_double(e->iterations, t->steps), er[n].y = e->mean;
+        n++, subspaces += q != NEURAL_TRIAL_FULL;
+    }
+    report_plot a = report_plot_default("Time of a step", "test step", "s");
+    a.log_y = 1;
+    report_add_plot(p, &a, s, n);
+    a = report_plot_default("Iterations of a step", "test step", "iterations"), a.log_y = 1;
+    report_add_plot(p, &a, it, n);
+    a = report_plot_default("Distance from full space, mean of the nodes", "test step", "over the diagonal"), a.log_y = 1;
+    report_add_plot(p, &a, er, subspaces);
+    for (int k = 0; k < n; k++) free((void *)it[k].y);
+}
+
+static int neural_page(neural_trial *t, neural_album *a) {
+    run *r = t->v->r;
+    char path[700], name[120], text[80];
+    const char *paths[1] = {path};
+    int used = t->e[NEURAL_TRIAL_LINEAR].used ? 3 : 2;
+    view_error why;
+    report_error bad;
+    view_image sheet = view_image_sheet(a->shot, a->shots, used, 6, a->label);
+    snprintf(path, sizeof path, "%s/states_%d.png", r->o.out, r->o.seed);
+    int ok = sheet.rgb && view_write_png(path, &sheet, &why);
+    view_image_free(&sheet);
+    if (!ok) return fail(r, "%s", sheet.rgb ? why.message : "out of memory for a picture");
+    report *p = report_begin(sweep_name(r, name), "neural subspaces against full space (purple)");
+    snprintf(text, sizeof text, "%.2f times vanilla's speed", neural_mean(t->e[0].seconds, t->steps) / neural_mean(t->e[1].seconds, t->steps));
+    report_status(p, "lipschitz", text, REPORT_INFO);
+    report_pictures(p, paths, NULL, 1);
+    neural_plots(p, t);
+    return report_end(p, r->o.out, &bad) ? 1 : fail(r, "%s", bad.message);
+}
+
+static int neural_run(neural *v) {
+    neural_trial t;
+    neural_album a;
+    char path[700];
+    run *r = v->r;
+    memset(&a, 0, sizeof a);
+    r->png = 1, r->vtu = r->obj = 0, r->s.frames.field = SCENE_FIELD_NONE;
+    int ok = neural_trial_open(v, &t) && open_frames(r);
+    snprintf(path, sizeof path, "%s/steps_%d.csv", r->o.out, r->o.seed);
+    a.rows = ok ? fopen(path, "w") : NULL;
+    if (ok && !a.rows) ok = fail(r, "%s: cannot be written: %s", path, strerror(errno));
+    if (ok) fputs("sequence,step,method,ms,iterations,evaluations,exit,gradient,energy,error_mean,error_farthest\n", a.rows);
+    ok = ok && neural_trial_run(&t, neural_watch_step, &a);
+    if (a.rows) fclose(a.rows);
+    if (ok) neural_table(&t);
+    ok = ok && neural_page(&t, &a);
+    for (int k = 0; k < a.shots; k++) view_image_free(&a.shot[k]);
+    neural_trial_close(&t);
+    return ok;
+}
+
 static int command_neural(run *r) {
     static neural v;
-    int ok = neural_open(r, &v) && neural_train(&v);
+    int ok = neural_open(r, &v);
+    if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v) : neural_evaluate(&v);
     neural_close(&v);
     return !ok ? 2 : v.stopped ? 3 : 0;
 }

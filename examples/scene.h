@@ -109,7 +109,8 @@
     .start                 positions at the start over the rest's, each axis, about its middle (1)
     .script                what happens to the body, at random: {handles, pulls, hold: [least, most]
                            steps from target to target ([10, 20]), length: steps of a sequence (60),
-                           train, test: sequences (10, 2), seed (1)}
+                           train, test: sequences (10, 2), seed (1), stride: quasi-static, steps of
+                           the script in one of a subspace (1)}
      .handles[]            {lower, upper, metres: nodes, as in pins; translate, rotate: [[low x, y, z],
                            [high]], m, and degrees along the axis, about the middle of the nodes}
      .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
@@ -239,7 +240,7 @@ typedef struct scene_neural {
     struct {
         scene_handle *handle;
         scene_pull *pull;
-        int handles, pulls, length, train, test, seed;
+        int handles, pulls, length, train, test, seed, stride;
         double hold[2];
     } script;
     struct {
@@ -1794,6 +1795,7 @@ static const scene__key scene__script_keys[] = {
     SCENE__INT(scene_neural, script.train, "train", 1, 1e6),
     SCENE__INT(scene_neural, script.test, "test", 1, 1e6),
     SCENE__INT(scene_neural, script.seed, "seed", 0, 1e9),
+    SCENE__INT(scene_neural, script.stride, "stride", 1, 1e6),
     SCENE__END};
 static const scene__key scene__pca_keys[] = {
     SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000), SCENE__END};
@@ -1870,7 +1872,7 @@ static void scene__neural_defaults(scene_neural *n) {
     n->r = 8, n->hidden[0] = n->hidden[1] = 200, n->layers = 2, n->samples = 256;
     for (int c = 0; c < 3; c++) n->start[c] = 1;
     n->script.hold[0] = 10, n->script.hold[1] = 20;
-    n->script.length = 60, n->script.train = 10, n->script.test = 2, n->script.seed = 1;
+    n->script.length = 60, n->script.train = 10, n->script.test = 2, n->script.seed = n->script.stride = 1;
     n->pca.tol = 1e-3, n->pca.most = 300;
     n->train.steps = 20000, n->train.batch = 64, n->train.rate = 1e-3, n->train.rate_end = 1e-5;
     n->train.lambda = n->train.sigma = 1, n->train.eps = 1e-8;
