@@ -673,8 +673,7 @@ typedef struct neural_trainer {
     uint64_t first, last;  // steps of the phase: from, to
     tss_net *decoder, *encoder;  // the MLPs alone: c of z, z of c. Supervised
     tss_training *t;             // unsupervised
-    double *g, *c, *c2, *z, *z_bar, *probe, *z_test;
-    int z_tests;
+    double *g, *c, *c2, *z, *z_bar, *z_mean, *probe, *z_test;
     double loss, lipschitz, lip, rate;  // running means of the losses
     double seconds;
     int skipped;
@@ -707,7 +706,19 @@ static void neural_draw(const neural *v, tss_rng *rng, int count, double *c) {
     }
 }
 
-// L_LS of a batch of frames of their own; its gradient is added to g.
+// Root mean square of z about its mean: the unit that Eq. 7 is in.
+static double neural_z_scale(const double *z, int count, int r, double *mean) {
+    double s = 0;
+    for (int k = 0; k < r; k++) {
+        mean[k] = 0;
+        for (int i = 0; i < count; i++) mean[k] += z[i * r + k] / count;
+        for (int i = 0; i < count; i++) s += (z[i * r + k] - mean[k]) * (z[i * r + k] - mean[k]) / ((double)count * r);
+    }
+    return sqrt(s);
+}
+
+// L_LS of a batch of frames of their own; its gradient is added to g. lipschitz.relative: L_LS is
+// multiplied by s^(2(o + 1)), s the spread of the batch's z: else it falls when z is but stretched.
 static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double *loss) {
     neural *v = t->v;
     const scene_neural *d = v->d;
@@ -718,10 +729,16 @@ static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double
     for (int i = 0; i < 2 * r * ld.probes && ld.estimator != TSS_LIPSCHITZ_EXACT; i++) t->probe[i] = tss_rng_normal(&t->m.rng);
     memset(t->z_bar, 0, (size_t)batch * (size_t)r * sizeof *t->z_bar);
     tss_result e = tss_net_forward(t->encoder, v->work, batch, t->c2, t->z);
+    double spread = d->lipschitz.relative ? neural_z_scale(t->z, batch, r, t->z_mean) : 1;
+    double power = 2 * (ld.order + 1), unit = pow(spread, power);
+    weight *= unit;
     if (e == TSS_OK)
         e = tss_loss_lipschitz(t->m.decoder, v->cubature ? v->cubature : v->elements, v->work, &ld, batch, t->z,
                                ld.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe, weight, loss, t->g,
                                d->lipschitz.through_encoder ? t->z_bar : NULL);
+    for (int i = 0; d->lipschitz.relative && i < batch * r; i++)
+        t->z_bar[i] += weight * *loss * power * (t->z[i] - t->z_mean[i % r]) / (batch * r * spread * spread);
+    *loss *= unit;
     if (e == TSS_OK && d->lipschitz.through_encoder)
         e = tss_net_backward(t->encoder, v->work, batch, t->c2, t->z_bar, t->g + dec, NULL);
     return e;
@@ -762,6 +779,7 @@ static int neural_trainer_supervised(neural_trainer *t) {
     t->g = (double *)need(neural_parameters(t->decoder) + neural_parameters(t->encoder), sizeof(double));
     t->c = (double *)need((size_t)v->d->train.batch * p, sizeof(double)), t->c2 = (double *)need(batch * p, sizeof(double));
     t->z = (double *)need(batch * r, sizeof(double)), t->z_bar = (double *)need(batch * r, sizeof(double));
+    t->z_mean = (double *)need(r, sizeof(double));
     t->probe = (double *)need(2 * r * (size_t)v->d->lipschitz.probes, sizeof(double));
     return 1;
 }
@@ -821,39 +839,27 @@ static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t)
     size_t all = neural_parameters(t->m.decoder) + neural_parameters(t->m.encoder);
     if (!t->m.adam && tss_adam_create(NULL, &a, all, &t->m.adam) != TSS_OK) return fail(v->r, "out of memory");
     t->seconds = neural_spent(v, phase, t->m.step);
-    double *x = neural_spread(v, v->test, v->tests, NEURAL_SAMPLES);
-    t->z_test = x;
+    t->z_test = neural_spread(v, v->test, v->tests, NEURAL_SAMPLES);
     return (v->d->unsupervised ? neural_trainer_unsupervised(t) : neural_trainer_supervised(t)) && neural_rows_open(t);
 }
 
 static void neural_trainer_close(neural_trainer *t) {
     tss_model_free(&t->m);
     tss_training_destroy(t->t), tss_net_destroy(t->decoder), tss_net_destroy(t->encoder);
-    free(t->g), free(t->c), free(t->c2), free(t->z), free(t->z_bar), free(t->probe), free(t->z_test);
+    free(t->g), free(t->c), free(t->c2), free(t->z), free(t->z_bar), free(t->z_mean), free(t->probe), free(t->z_test);
     if (t->rows) fclose(t->rows);
-}
-
-// Root mean square of z about its mean: the unit that Eq. 7 is in.
-static double neural_z_scale(const double *z, int count, int r) {
-    double s = 0;
-    for (int k = 0; k < r; k++) {
-        double mean = 0;
-        for (int i = 0; i < count; i++) mean += z[i * r + k] / count;
-        for (int i = 0; i < count; i++) s += (z[i * r + k] - mean) * (z[i * r + k] - mean) / ((double)count * r);
-    }
-    return sqrt(s);
 }
 
 // The model to its file, and a row of the curves.
 static int neural_checkpoint(neural_trainer *t) {
     neural *v = t->v;
     char path[700];
-    double *z = neural_z(v, &t->m, t->z_test, NEURAL_SAMPLES);
+    double *z = neural_z(v, &t->m, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     const tss_elements *e = v->cubature ? v->cubature : v->elements;
     (void)tss_lipschitz_estimate(t->m.decoder, e, v->work, 2, NEURAL_SAMPLES, z, &t->lip);
     fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
-            t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r), t->rate, t->skipped);
-    fflush(t->rows), free(z);
+            t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped);
+    fflush(t->rows), free(z), free(mean);
     neural_path(v, t->phase, path);
     tss_result r = tss_model_write(NULL, &t->m, path);
     return r == TSS_OK ? 1 : fail(v->r, "%s: cannot be written: %s", path, tss_result_text(r));
@@ -1164,8 +1170,9 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
     double *z = neural_z(v, &e->m, x, count);
     tss_result r = tss_lipschitz_estimate(e->m.decoder, v->elements, v->work, 2, count, z, &e->lip);
-    e->z_scale = neural_z_scale(z, count, v->d->r);
-    free(x), free(z);
+    double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
+    e->z_scale = neural_z_scale(z, count, v->d->r, mean);
+    free(x), free(z), free(mean);
     return r == TSS_OK ? 1 : fail(v->r, "%s: Eq. 7: %s", v->r->o.scene, tss_result_text(r));
 }
 

@@ -119,7 +119,8 @@
                            (0), lambda (1), sigma (1), eps (1e-8), ramp (0)}
     .lipschitz             {steps (5000), weight (1e-3), batch (16), rate (1e-4), rate_end (1e-6),
                            warmup (0), order (2), estimator: exact | uv | u (u), probes (1), undivided
-                           (false), through_encoder (true), cubature: cells, 0: all (0), samples:
+                           (false), through_encoder (true), relative: L_LS in units
+                           of the spread of z, supervised (false), cubature: cells, 0: all (0), samples:
                            that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
                            (10), max_line (128), max_iterations (1024)}
@@ -252,7 +253,7 @@ typedef struct scene_neural {
         double rate, rate_end, lambda, sigma, eps;
     } train;
     struct {
-        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, cubature, samples;
+        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, cubature, samples;
         double rate, rate_end, weight;
     } lipschitz;
     struct {
@@ -1822,6 +1823,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__INT(scene_neural, lipschitz.probes, "probes", 1, 1000),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.undivided, "undivided"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.through_encoder, "through_encoder"),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.relative, "relative"),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
     SCENE__END};
