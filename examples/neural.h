@@ -1127,7 +1127,7 @@ static void neural_table(const neural_trial *t) {
            "converged/saddle/line/it", "gradient", "energy", "error", "farthest", "projection", "Lip");
     for (int k = 0; k < NEURAL_TRIALS; k++) {
         const neural_entry *e = &t->e[k];
-        char exits[40];
+        char exits[60];
         int n = t->steps;
         if (!e->used) continue;
         snprintf(exits, sizeof exits, "%d/%d/%d/%d", neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE),

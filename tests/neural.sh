@@ -4,7 +4,7 @@ build=$1; out=$build/neural_out; scene=examples/scenes/neural_twist_bar_small.js
 rm -rf "$out"
 claim() { if eval "$2"; then echo "ok $1"; else echo "FAILED $1"; fi; }
 tiny="--set bodies.0.shape.cells=[4,2,2] --set neural.r=4 --set neural.hidden=[16] --set neural.script.length=20
-    --set neural.script.hold=[5,10] --set neural.script.train=6 --set neural.script.test=1 --set neural.train.steps=400
+    --set neural.script.hold=[5,10] --set neural.script.train=6 --set neural.script.test=1 --set neural.script.stride=1 --set neural.train.steps=400
     --set neural.lipschitz.steps=200 --set neural.lipschitz.cubature=20 --set neural.samples=8 --set frames.size=[160,96]"
 # shellcheck disable=SC2086
 tss() { action=$1; to=$2; shift 2; "$build/tss" neural "$action" $scene $tiny -o "$to" "$@"; }
