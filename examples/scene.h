@@ -103,6 +103,28 @@
                            enriched | error | progress (enriched if adaptive, else none),
                            range: [low, high], wireframe: 0..1 (0)}
    run                     {check (false), every (1), budget_ms (0), frames: "png,vtu,obj" ("")}
+   neural                  of the first body, for `tss neural` (neural.h):
+    .system                supervised | unsupervised (supervised)
+    .r .hidden .activation inputs of the decoder (8), widths ([200, 200]), elu | silu | softplus | gelu
+    .start                 positions at the start over the rest's, each axis, about its middle (1)
+    .script                what happens to the body, at random: {handles, pulls, hold: [least, most]
+                           steps from target to target ([10, 20]), length: steps of a sequence (60),
+                           train, test: sequences (10, 2), seed (1), stride: quasi-static, steps of
+                           the script in one of a subspace (1)}
+     .handles[]            {lower, upper, metres: nodes, as in pins; translate, rotate: [[low x, y, z],
+                           [high]], m, and degrees along the axis, about the middle of the nodes}
+     .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
+    .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300)}
+    .train                 vanilla: {steps (20000), batch (64), rate (1e-3), rate_end (1e-5), warmup
+                           (0), lambda (1), sigma (1), eps (1e-8), ramp (0)}
+    .lipschitz             {steps (5000), weight (1e-3), batch (16), rate (1e-4), rate_end (1e-6),
+                           warmup (0), order (2), estimator: exact | uv | u (u), probes (1), undivided
+                           (false), through_encoder (true), relative: L_LS in units
+                           of the spread of z, supervised (false), cubature: cells, 0: all (0), samples:
+                           that choose them (64)}
+    .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
+                           (10), max_line (128), max_iterations (1024)}
+    .samples               of Eq. 7 (256)
 
    IPC SCRIPTS  time density stiffness energy timeIntegration dampingStiff dampingRatio
    turnOffGravity dHat epsv tuning fricIterAmt tol size rotateModel halfSpace ground meshCO shapes
@@ -113,7 +135,8 @@
    ERRORS  Functions return 1, or 0 and a sentence: file, key or line, and what was expected.
    MEMORY  malloc. THREADS  One scene, one thread.
 
-   >>scene  >>scene_tools  >>scene_keys  >>scene_meshes  >>scene_bases  >>scene_json  >>scene_script
+   >>scene  >>scene_tools  >>scene_keys  >>scene_meshes  >>scene_bases  >>scene_json  >>scene_neural
+   >>scene_script
    >>scene_snapshots  >>scene_build  >>scene_drive                                                */
 #ifndef SCENE_H
 #define SCENE_H
@@ -199,6 +222,46 @@ typedef struct scene_plane {
     double origin[3], normal[3], mu;
 } scene_plane;
 
+// Nodes that are told where to be, at random within a box of six parameters: translation, rotation.
+typedef struct scene_handle {
+    int *node, nodes;  // of the body
+    double translate[2][3], rotate[2][3];  // low and high; m, rad
+} scene_handle;
+
+typedef struct scene_pull {
+    int *node, nodes;
+    double force[3];  // N, the most of each axis
+} scene_pull;
+
+#define SCENE_HIDDEN 16
+
+typedef struct scene_neural {
+    int given, unsupervised, r, hidden[SCENE_HIDDEN], layers, activation, samples;  // layers: hidden
+    double start[3];
+    struct {
+        scene_handle *handle;
+        scene_pull *pull;
+        int handles, pulls, length, train, test, seed, stride;
+        double hold[2];
+    } script;
+    struct {
+        double tol;
+        int most;
+    } pca;
+    struct {
+        int steps, batch, warmup, ramp;
+        double rate, rate_end, lambda, sigma, eps;
+    } train;
+    struct {
+        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, cubature, samples;
+        double rate, rate_end, weight;
+    } lipschitz;
+    struct {
+        int kind, memory, max_line, max_iterations;
+        double eps, ftol;
+    } solver;
+} scene_neural;
+
 typedef enum scene_field {
     SCENE_FIELD_NONE,
     SCENE_FIELD_J,
@@ -267,6 +330,7 @@ typedef struct scene {
     scene_driven *driven;
     int drivens;
     char *forces_on;  // one a force, in the order of the bodies
+    scene_neural neural;
 } scene;
 
 // assets: where mesh files are looked for first (NULL: beside the scene). set: "key=value" lines,
@@ -1618,6 +1682,239 @@ static int scene__read_bodies(scene__reader *r, const cJSON *v, void *base) {
     return 1;
 }
 
+// ---------------------------------------------------------------------------------------------
+// >>scene_neural (private)
+// Read when the bodies are there: its boxes choose nodes of the first one.
+// ---------------------------------------------------------------------------------------------
+
+static const char *const scene__systems[] = {"supervised", "unsupervised", NULL};
+static const char *const scene__activations[] = {"elu", "silu", "softplus", "gelu", NULL};
+static const char *const scene__estimators[] = {"exact", "uv", "u", NULL};
+static const char *const scene__reduced_solvers[] = {"lbfgs", "newton", NULL};
+
+typedef struct scene__handle_item {
+    scene__region where;
+    scene_handle h;
+    scene_pull p;
+} scene__handle_item;
+
+// [[x, y, z], [x, y, z]], the first nowhere above the second.
+static int scene__read_range(scene__reader *r, const cJSON *v, double unit, double out[2][3]) {
+    if (!cJSON_IsArray(v) || cJSON_GetArraySize(v) != 2)
+        return scene__expected(r, v, "[[low x, y, z], [high x, y, z]]");
+    for (int k = 0; k < 2; k++) {
+        size_t n = scene__enter(r, NULL, k);
+        if (!scene__read_numbers(r, cJSON_GetArrayItem(v, k), 2, 3, out[k])) return 0;
+        scene__leave(r, n);
+    }
+    for (int c = 0; c < 3; c++) {
+        if (out[0][c] > out[1][c]) return scene__expected(r, v, "low <= high on each axis");
+        out[0][c] *= unit, out[1][c] *= unit;
+    }
+    return 1;
+}
+
+static int scene__read_translate(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_range(r, v, 1, ((scene__handle_item *)base)->h.translate);
+}
+static int scene__read_rotate(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_range(r, v, SCENE__RADIAN, ((scene__handle_item *)base)->h.rotate);
+}
+
+#define SCENE__HANDLE_WHERE                                                 \
+    SCENE__OF(SCENE__VECTOR, scene__handle_item, where.lower, "lower"),     \
+        SCENE__OF(SCENE__VECTOR, scene__handle_item, where.upper, "upper"), \
+        SCENE__OF(SCENE__FLAG, scene__handle_item, where.metres, "metres")
+static const scene__key scene__handle_keys[] = {
+    SCENE__HANDLE_WHERE, SCENE__FUN("translate", scene__read_translate),
+    SCENE__FUN("rotate", scene__read_rotate), SCENE__END};
+static const scene__key scene__pull_keys[] = {
+    SCENE__HANDLE_WHERE, SCENE__OF(SCENE__VECTOR, scene__handle_item, p.force, "force"), SCENE__END};
+
+static int *scene__handle_nodes(scene__reader *r, const cJSON *v, const scene__key *keys,
+                                scene__handle_item *it, int *nodes) {
+    const scene_body *b = &r->s->body[0];
+    memset(it, 0, sizeof *it);
+    it->where = scene__everywhere();
+    if (!scene__read_object(r, v, keys, it)) return NULL;
+    int *node = scene__select(&b->mesh, &it->where, nodes);
+    if (node && *nodes > 0) return node;
+    if (node) scene__nobody(r, b);
+    if (!node) scene__fail(r->error, "out of memory");
+    free(node);
+    return NULL;
+}
+
+static int scene__read_handle(scene__reader *r, const cJSON *v, void *base) {
+    scene_neural *n = (scene_neural *)base;
+    scene__handle_item it;
+    int nodes, *node = scene__handle_nodes(r, v, scene__handle_keys, &it, &nodes);
+    void *p = node ? scene__grow(n->script.handle, n->script.handles, sizeof *n->script.handle, r->error) : NULL;
+    if (!p) return free(node), 0;
+    n->script.handle = (scene_handle *)p;
+    it.h.node = node, it.h.nodes = nodes;
+    n->script.handle[n->script.handles++] = it.h;
+    return 1;
+}
+
+static int scene__read_pull(scene__reader *r, const cJSON *v, void *base) {
+    scene_neural *n = (scene_neural *)base;
+    scene__handle_item it;
+    int nodes, *node = scene__handle_nodes(r, v, scene__pull_keys, &it, &nodes);
+    void *p = node ? scene__grow(n->script.pull, n->script.pulls, sizeof *n->script.pull, r->error) : NULL;
+    if (!p) return free(node), 0;
+    n->script.pull = (scene_pull *)p;
+    it.p.node = node, it.p.nodes = nodes;
+    n->script.pull[n->script.pulls++] = it.p;
+    return 1;
+}
+
+static int scene__read_handles(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_array(r, v, scene__read_handle, base);
+}
+static int scene__read_pulls(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_array(r, v, scene__read_pull, base);
+}
+
+static int scene__read_hidden(scene__reader *r, const cJSON *v, void *base) {
+    scene_neural *n = (scene_neural *)base;
+    double width[SCENE_HIDDEN];
+    n->layers = scene__read_numbers(r, v, 1, SCENE_HIDDEN, width);
+    for (int k = 0; k < n->layers; k++) {
+        n->hidden[k] = (int)width[k];
+        if (!(width[k] >= 1 && width[k] <= 1e5 && width[k] == floor(width[k])))
+            return scene__expected(r, v, "whole numbers from 1 to 100000 in [ ]");
+    }
+    return n->layers > 0;
+}
+
+static const scene__key scene__script_keys[] = {
+    SCENE__FUN("handles", scene__read_handles),
+    SCENE__FUN("pulls", scene__read_pulls),
+    SCENE__OF(SCENE__PAIR, scene_neural, script.hold, "hold"),
+    SCENE__INT(scene_neural, script.length, "length", 1, 1e6),
+    SCENE__INT(scene_neural, script.train, "train", 1, 1e6),
+    SCENE__INT(scene_neural, script.test, "test", 1, 1e6),
+    SCENE__INT(scene_neural, script.seed, "seed", 0, 1e9),
+    SCENE__INT(scene_neural, script.stride, "stride", 1, 1e6),
+    SCENE__END};
+static const scene__key scene__pca_keys[] = {
+    SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000), SCENE__END};
+static const scene__key scene__train_keys[] = {
+    SCENE__INT(scene_neural, train.steps, "steps", 1, 1e9),
+    SCENE__INT(scene_neural, train.batch, "batch", 2, 1e5),
+    SCENE__POS(scene_neural, train.rate, "rate"),
+    SCENE__POS(scene_neural, train.rate_end, "rate_end"),
+    SCENE__INT(scene_neural, train.warmup, "warmup", 0, 1e9),
+    SCENE__NUM(scene_neural, train.lambda, "lambda", 0, 1e300),
+    SCENE__POS(scene_neural, train.sigma, "sigma"),
+    SCENE__NUM(scene_neural, train.eps, "eps", 0, 1),
+    SCENE__INT(scene_neural, train.ramp, "ramp", 0, 1e9),
+    SCENE__END};
+static const scene__key scene__lipschitz_keys[] = {
+    SCENE__INT(scene_neural, lipschitz.steps, "steps", 1, 1e9),
+    SCENE__INT(scene_neural, lipschitz.batch, "batch", 2, 1e5),
+    SCENE__NUM(scene_neural, lipschitz.weight, "weight", 0, 1e300),
+    SCENE__POS(scene_neural, lipschitz.rate, "rate"),
+    SCENE__POS(scene_neural, lipschitz.rate_end, "rate_end"),
+    SCENE__INT(scene_neural, lipschitz.warmup, "warmup", 0, 1e9),
+    SCENE__INT(scene_neural, lipschitz.order, "order", 0, 2),
+    SCENE__ONE(scene_neural, lipschitz.estimator, "estimator", scene__estimators),
+    SCENE__INT(scene_neural, lipschitz.probes, "probes", 1, 1000),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.undivided, "undivided"),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.through_encoder, "through_encoder"),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.relative, "relative"),
+    SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
+    SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
+    SCENE__END};
+static const scene__key scene__reduced_keys[] = {
+    SCENE__ONE(scene_neural, solver.kind, "kind", scene__reduced_solvers),
+    SCENE__NUM(scene_neural, solver.eps, "eps", 0, 1e300),
+    SCENE__NUM(scene_neural, solver.ftol, "ftol", 0, 1),
+    SCENE__INT(scene_neural, solver.memory, "memory", 1, 64),
+    SCENE__INT(scene_neural, solver.max_line, "max_line", 1, 1e6),
+    SCENE__INT(scene_neural, solver.max_iterations, "max_iterations", 1, 1e9),
+    SCENE__END};
+
+static int scene__read_script_of(scene__reader *r, const cJSON *v, void *base) {
+    const scene_neural *n = (const scene_neural *)base;
+    if (!scene__read_object(r, v, scene__script_keys, base)) return 0;
+    return n->script.hold[0] >= 1 && n->script.hold[0] <= n->script.hold[1]
+               ? 1
+               : scene__expected(r, v, "hold: [least, most] steps, 1 <= least <= most");
+}
+static int scene__read_pca(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_object(r, v, scene__pca_keys, base);
+}
+static int scene__read_train(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_object(r, v, scene__train_keys, base);
+}
+static int scene__read_lipschitz(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_object(r, v, scene__lipschitz_keys, base);
+}
+static int scene__read_reduced(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_object(r, v, scene__reduced_keys, base);
+}
+
+static const scene__key scene__neural_keys[] = {
+    SCENE__ONE(scene_neural, unsupervised, "system", scene__systems),
+    SCENE__INT(scene_neural, r, "r", 1, 1000),
+    SCENE__FUN("hidden", scene__read_hidden),
+    SCENE__ONE(scene_neural, activation, "activation", scene__activations),
+    SCENE__OF(SCENE__VECTOR, scene_neural, start, "start"),
+    SCENE__FUN("script", scene__read_script_of),
+    SCENE__FUN("pca", scene__read_pca),
+    SCENE__FUN("train", scene__read_train),
+    SCENE__FUN("lipschitz", scene__read_lipschitz),
+    SCENE__FUN("solver", scene__read_reduced),
+    SCENE__INT(scene_neural, samples, "samples", 2, 1e5),
+    SCENE__END};
+
+static void scene__neural_defaults(scene_neural *n) {
+    n->r = 8, n->hidden[0] = n->hidden[1] = 200, n->layers = 2, n->samples = 256;
+    for (int c = 0; c < 3; c++) n->start[c] = 1;
+    n->script.hold[0] = 10, n->script.hold[1] = 20;
+    n->script.length = 60, n->script.train = 10, n->script.test = 2, n->script.seed = n->script.stride = 1;
+    n->pca.tol = 1e-3, n->pca.most = 300;
+    n->train.steps = 20000, n->train.batch = 64, n->train.rate = 1e-3, n->train.rate_end = 1e-5;
+    n->train.lambda = n->train.sigma = 1, n->train.eps = 1e-8;
+    n->lipschitz.steps = 5000, n->lipschitz.batch = 16, n->lipschitz.rate = 1e-4;
+    n->lipschitz.rate_end = 1e-6, n->lipschitz.weight = 1e-3, n->lipschitz.order = 2;
+    n->lipschitz.estimator = 2, n->lipschitz.probes = 1, n->lipschitz.through_encoder = 1;
+    n->lipschitz.samples = 64;
+    n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9, n->solver.memory = 10;
+    n->solver.max_line = 128, n->solver.max_iterations = 1024;
+}
+
+static int scene__read_neural(scene__reader *r, const cJSON *v) {
+    scene *s = r->s;
+    scene_neural *n = &s->neural;
+    size_t at = scene__enter(r, "neural", 0);
+    if (s->bodies == 0)
+        return scene__fail(r->error, "%s: neural: expected a body in bodies[]", s->file);
+    scene__neural_defaults(n);
+    n->given = 1;
+    if (!scene__read_object(r, v, scene__neural_keys, n)) return 0;
+    scene__leave(r, at);
+    // Nodes were chosen by the rest shape; then the body is put where it starts.
+    scene_body *b = &s->body[0];
+    double mid[3];
+    size_t count = 3 * (size_t)b->mesh.nodes;
+    if (b->rest || (n->start[0] == 1 && n->start[1] == 1 && n->start[2] == 1)) return 1;
+    b->rest = (double *)malloc(count * sizeof(double) + 1);
+    if (!b->rest) return scene__fail(r->error, "out of memory");
+    memcpy(b->rest, b->mesh.x, count * sizeof(double));
+    scene__middle(b->rest, b->mesh.nodes, mid);
+    for (size_t i = 0; i < count; i++)
+        b->mesh.x[i] = mid[i % 3] + n->start[i % 3] * (b->rest[i] - mid[i % 3]);
+    return 1;
+}
+
+static int scene__keep_neural(scene__reader *r, const cJSON *v, void *base) {
+    (void)r, (void)v, (void)base;
+    return 1;
+}
+
 static const scene__key scene__root_keys[] = {SCENE__FUN("world", scene__read_world),
                                               SCENE__FUN("solver", scene__read_solver),
                                               SCENE__FUN("contact", scene__read_contact),
@@ -1626,6 +1923,7 @@ static const scene__key scene__root_keys[] = {SCENE__FUN("world", scene__read_wo
                                               SCENE__FUN("camera", scene__read_camera),
                                               SCENE__FUN("frames", scene__read_frames),
                                               SCENE__FUN("run", scene__read_run),
+                                              SCENE__FUN("neural", scene__keep_neural),
                                               SCENE__END};
 
 // world.dim decides how bodies are read, wherever it stands in the file.
@@ -1633,7 +1931,9 @@ static int scene__read_root(scene__reader *r, const cJSON *root) {
     const cJSON *world = cJSON_GetObjectItemCaseSensitive(root, "world");
     const cJSON *dim = world ? cJSON_GetObjectItemCaseSensitive(world, "dim") : NULL;
     if (dim && cJSON_IsNumber(dim) && dim->valueint == 2) r->s->world.dim = 2;
-    return scene__read_object(r, root, scene__root_keys, r->s);
+    if (!scene__read_object(r, root, scene__root_keys, r->s)) return 0;
+    const cJSON *neural = cJSON_GetObjectItemCaseSensitive(root, "neural");
+    return neural ? scene__read_neural(r, neural) : 1;
 }
 
 // The member or element that `name` stands for; made if there is none.
@@ -2405,6 +2705,9 @@ static void scene__drivens_free(scene *s) {
 void scene_free(scene *s) {
     scene__drivens_free(s);
     for (int k = 0; k < s->bodies; k++) scene__body_free(&s->body[k]);
+    for (int k = 0; k < s->neural.script.handles; k++) free(s->neural.script.handle[k].node);
+    for (int k = 0; k < s->neural.script.pulls; k++) free(s->neural.script.pull[k].node);
+    free(s->neural.script.handle), free(s->neural.script.pull);
     free(s->body), free(s->plane), free(s->warnings);
     memset(s, 0, sizeof *s);
 }

@@ -8,6 +8,8 @@
    tss compare --sweep SCENE [--nodes LIST] [--modes LIST] [--tols LIST] [--name NAME] ...
    tss modes SCENE [-o DIR] [--count K] ...
    tss check SCENE [--assets DIR] [--set key=value]...
+   tss neural train|run|evaluate SCENE [-o DIR] [--seed N] [--minutes M]
+              [--method vanilla|lipschitz] [--threads N] [--set key=value]...
    tss --version | --help
 
    SCENE is JSON or a script of the IPC reference code; scene.h lists every key. run leaves in DIR
@@ -19,6 +21,7 @@
    build that leaves out the others; it takes no step. modes lists and draws bases.
 
    compare --sweep: error against run time over solvers and tolerances, sweep.h.
+   neural: neural subspaces, neural.h.
    compare takes each step from the same state in full space (direct, pcg, auto) and adaptively;
    then M steps freely. DIR/compare.csv has a row a step. Its last line:
        error E speedup S best B final F
@@ -37,6 +40,7 @@
 #include "tss.h"
 #include "tss_ipc.h"
 #include "tss_subspace.h"
+#include "tss_neural.h"
 #include "tss_io.h"
 #include "tss_shapes.h"
 
@@ -72,7 +76,9 @@ typedef struct options {
     const char *set[MAX_SETS];
     const char *nodes, *modes, *tols, *name;  // of a sweep
     int sets, steps, threads, every, check, repeat, from, free_steps, count, sweep;
-    double budget_ms;
+    double budget_ms, minutes;
+    const char *action, *method;  // of neural
+    int seed;
 } options;
 
 static int usage(FILE *to) {
@@ -88,6 +94,8 @@ static int usage(FILE *to) {
         "               [--name NAME], and the options of compare\n"
         "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
+        "       tss neural train|run|evaluate SCENE [-o DIR] [--seed N] [--minutes M]\n"
+        "               [--method vanilla|lipschitz] [--threads N] [--set key=value]...\n"
         "       tss --version\n",
         to);
     return to == stdout ? 0 : 2;
@@ -166,6 +174,7 @@ static int take(options *o, const char *name, const char *value) {
                   {"--repeat", 1, offsetof(options, repeat)},
                   {"--from", 0, offsetof(options, from)},
                   {"--free-steps", 0, offsetof(options, free_steps)},
+                  {"--seed", 0, offsetof(options, seed)},
                   {"--count", 1, offsetof(options, count)}};
     if (!value) return complain(name, "", "a value");
     for (size_t k = 0; k < sizeof counts / sizeof *counts; k++)
@@ -185,6 +194,13 @@ static int take(options *o, const char *name, const char *value) {
     if (strcmp(name, "--mode") == 0) return take_key(o, "solver.mode", value, o->mode);
     if (strcmp(name, "--color") == 0) return take_color(o, value);
     if (strcmp(name, "--set") == 0) return add_set(o, value);
+    if (strcmp(name, "--method") == 0)
+        return o->method = value, strcmp(value, "vanilla") == 0 || strcmp(value, "lipschitz") == 0 ||
+                                      complain(name, value, "vanilla or lipschitz");
+    if (strcmp(name, "--minutes") == 0)
+        return tss_parse_double(value, strlen(value), &o->minutes) == TSS_OK && o->minutes > 0
+                   ? 1
+                   : complain(name, value, "minutes > 0");
     if (strcmp(name, "--budget-ms") == 0)
         return tss_parse_double(value, strlen(value), &o->budget_ms) == TSS_OK && o->budget_ms > 0
                    ? 1
@@ -197,7 +213,14 @@ static int read_options(int argc, char **argv, options *o) {
     o->steps = o->free_steps = -1, o->repeat = 1;
     o->nodes = "1,0.5,0.2,0.1,0.05,0.02", o->modes = "0.5,0.05";
     o->command = argv[1];
-    for (int k = 2; k < argc; k++) {
+    int first = 2;
+    if (strcmp(o->command, "neural") == 0) {
+        o->action = argc > 2 ? argv[2] : "";
+        if (strcmp(o->action, "train") != 0 && strcmp(o->action, "run") != 0 && strcmp(o->action, "evaluate") != 0)
+            return complain("neural", o->action, "train, run or evaluate");
+        first = 3;
+    }
+    for (int k = first; k < argc; k++) {
         if (strcmp(argv[k], "--check") == 0)
             o->check = 1;
         else if (strcmp(argv[k], "--sweep") == 0)
@@ -1752,6 +1775,7 @@ static int compare(run *r, contest *t) {
 }
 
 #include "sweep.h"
+#include "neural.h"
 
 static int command_compare(run *r) {
     contest t;
@@ -1950,10 +1974,11 @@ int main(int argc, char **argv) {
     } commands[] = {{"run", command_run},
                     {"check", command_check},
                     {"compare", command_compare},
-                    {"modes", command_modes}};
+                    {"modes", command_modes},
+                    {"neural", command_neural}};
     int which = 0;
-    while (which < 4 && argc >= 2 && strcmp(argv[1], commands[which].name) != 0) which++;
-    if (argc < 2 || which == 4) return usage(stderr);
+    while (which < 5 && argc >= 2 && strcmp(argv[1], commands[which].name) != 0) which++;
+    if (argc < 2 || which == 5) return usage(stderr);
     if (!read_options(argc, argv, &r.o)) return 2;
     int code = commands[which].run(&r);
     if (r.why.text[0]) fprintf(stderr, "tss: %s\n", r.why.text);

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs the tests and ends with `N passed, N failed`.
 #   tests/run.sh BUILD             everything
-#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|sweep|stability|unit   one part
+#   tests/run.sh BUILD nodeps|compat|sanitize|fuzz|scenes|figures|sweep|stability|neural|unit   one part
 # Public test data is used where it lies beside the checkout (or at $TSS_DATA); nothing needs it.
 set -u
 export OMP_WAIT_POLICY=passive  # tests may share the machine: threads that wait shall not spin
@@ -203,11 +203,13 @@ claims() {
 figures() { claims figures; }
 # Error against run time.
 sweep() { claims sweep; }
+# Neural subspaces: training, its resumption, evaluation.
+neural() { claims neural; }
 # Stiff and extreme cases, judged on every iterate.
 stability() { claims stability; }
 
 case $part in
-all) unit; checkers; scenes; figures; sweep; stability; nodeps; compat; sanitize ;;
+all) unit; checkers; scenes; figures; sweep; stability; neural; nodeps; compat; sanitize ;;
 *) $part ;;
 esac
 printf '%d passed, %d failed\n' "$passed" "$failed"

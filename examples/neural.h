@@ -1,0 +1,1368 @@
+/* neural.h: `tss neural`, neural subspaces after paper B (a part of tss.c, of its own for length)
+
+   tss neural train    SCENE [-o DIR] [--seed N] [--minutes M] [--method vanilla|lipschitz] ...
+   tss neural run      SCENE [-o DIR] [--seed N] ...
+   tss neural evaluate SCENE [-o DIR] [--seed N] ...
+
+   The scene's section "neural" (scene.h) says what is learned of its first body, and what happens to
+   it, at random: handles (nodes that are told where to be) and pulls (forces). Full space and
+   subspace have one energy, tss_neural_density.
+
+   train   1. supervised: sequences of frames in full space → DIR/frames.bin
+           2. a linear basis of the frames (SVD in the mass norm) around both networks
+           3. base_N.tssn: Eq. 3 or 4 alone, train.steps steps
+           4. the cells that stand for all of them in L_LS (Eq. 11), by the subspace of 3
+           5. vanilla_N.tssn and lipschitz_N.tssn: lipschitz.steps more steps from 3, without and with
+              L_LS (Eq. 10)
+           N is --seed. What is in DIR is gone on with: a run that was killed, or that --minutes
+           stopped, is resumed by the same command. train_N.csv has what the curves need, and the
+           seconds spent.
+   run     the test sequences in full space and in each subspace: steps_N.csv, pictures, report.html
+   evaluate the same, and Eq. 7 and projections of the test's states: a row a method is appended to
+           DIR/evaluate.csv
+
+   Eq. 3 costs only as much as the networks: x = x0 + B c with BᵀMB = s² I, so that ‖Δx‖²_M is s²‖Δc‖²
+   but for what B does not reach, which no θ alters. Training sees c. s² is the mean of ‖x − x0‖²_M,
+   and L_C therefore the share of the motion that is missed.                                       */
+
+#define NEURAL_SNAPSHOTS 400  // frames whose Gram matrix is taken apart
+#define NEURAL_SAMPLES 48     // frames of the estimate of Eq. 7 while training
+
+typedef enum neural_phase { NEURAL_BASE, NEURAL_VANILLA, NEURAL_LIPSCHITZ } neural_phase;
+static const char *const neural_phases[] = {"base", "vanilla", "lipschitz"};
+
+typedef struct neural {
+    run *r;
+    scene_neural *d;
+    int dim, nodes, cells, n;  // n: coordinates
+    double h, size;            // s, 0: quasi-static; longest side of the rest shape
+    double *X, *x0, *mass;     // n each: rest, start, kg
+    int *cell;
+    double lame[2];
+    unsigned char *held;  // of each coordinate: not free
+    int handles, *handle;  // nodes of all handles
+    tss_elements *elements, *cubature;
+    tss_work *work;
+    // Frames, coordinate after coordinate: sequences of d->script.length.
+    double *train, *test;
+    int trains, tests;
+    // x = x0 + B c, c = Aᵀ(x − x0): n × p, row-major. code: of the training frames, trains × p.
+    int p;
+    double *B, *A, *code, *code_test;
+    double *before;  // n: full space one step ago, for a first guess of the next
+    double left;    // largest distance of a node in what B misses, over size
+    double deadline;  // of now()
+    int terminal, stopped;  // stopped: by the deadline
+    double shown;     // when progress was last shown
+} neural;
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_system: the body as the learner sees it
+// ---------------------------------------------------------------------------------------------
+
+// A bar on a terminal, else a line every ten seconds.
+static void neural_progress(neural *v, double done, const char *format, ...) {
+    char text[240], bar[31];
+    va_list args;
+    double t = now(NULL);
+    if (done < 1 && t < v->shown + (v->terminal ? 0.2 : 10)) return;
+    v->shown = t;
+    va_start(args, format);
+    vsnprintf(text, sizeof text, format, args);
+    va_end(args);
+    for (int k = 0; k < 30; k++) bar[k] = 30 * done > k ? '#' : '.';
+    bar[30] = 0;
+    if (v->terminal)
+        fprintf(stderr, "\r[%s] %s\033[K%s", bar, text, done >= 1 ? "\n" : "");
+    else
+        fprintf(stderr, "%5.1f%% %s\n", 100 * done, text);
+}
+
+static int neural_late(neural *v) {
+    v->stopped |= now(NULL) >= v->deadline;
+    return v->stopped;
+}
+
+static int neural_check(run *r) {
+    const scene *s = &r->s;
+    if (!s->neural.given)
+        return fail(r, "%s: expected a section \"neural\" (docs/neural.md)", r->o.scene);
+    if (s->bodies != 1 || s->body[0].obstacle || s->body[0].E || s->planes)
+        return fail(r, "%s: neural: expected one soft body of one material, and no planes", r->o.scene);
+    if (s->world.integrator != TSS_QUASISTATIC && s->world.integrator != TSS_IMPLICIT_EULER)
+        return fail(r, "%s: world.integrator is \"%s\", expected \"quasistatic\" or \"euler\" with neural",
+                    r->o.scene, scene__integrators[s->world.integrator]);
+    if (s->contact.enabled)
+        return fail(r, "%s: contact.enabled is true, expected false with neural", r->o.scene);
+    if (s->body[0].bases || s->body[0].forces || s->body[0].motion.moves)
+        return fail(r, "%s: bodies[0]: expected no basis, forces or motion with neural; its script "
+                       "has handles and pulls", r->o.scene);
+    for (int k = 0; k < s->body[0].pins; k++)
+        if (s->body[0].pin[k].motion.moves)
+            return fail(r, "%s: bodies[0].pins[%d].motion: expected neural.script.handles", r->o.scene, k);
+    return 1;
+}
+
+static void neural_take_body(neural *v) {
+    const scene_body *b = &v->r->s.body[0];
+    const tss_mesh *m = &b->mesh;
+    double lo[3], hi[3];
+    v->dim = v->r->s.world.dim, v->nodes = m->nodes, v->n = v->nodes * v->dim;
+    v->cells = v->dim == 3 ? m->tets : m->triangles;
+    v->h = v->r->s.world.integrator == TSS_QUASISTATIC ? 0 : v->r->s.world.dt;
+    size_t n = (size_t)v->n, corners = (size_t)v->cells * (size_t)(v->dim + 1);
+    v->X = (double *)need(n, sizeof(double)), v->x0 = (double *)need(n, sizeof(double));
+    v->mass = (double *)need(n, sizeof(double)), v->cell = (int *)need(corners, sizeof(int));
+    v->before = (double *)need(n, sizeof(double)), v->held = (unsigned char *)need(n, 1), v->handle = (int *)need((size_t)v->nodes, sizeof(int));
+    const double *rest = b->rest ? b->rest : m->x;
+    for (int i = 0; i < v->n; i++) {
+        v->X[i] = rest[3 * (i / v->dim) + i % v->dim];
+        v->x0[i] = m->x[3 * (i / v->dim) + i % v->dim];
+    }
+    memcpy(v->cell, v->dim == 3 ? m->tet : m->triangle, corners * sizeof(int));
+    scene__box_empty(lo, hi);
+    scene__box(rest, m->nodes, lo, hi);
+    for (int c = 0; c < 3; c++) v->size = fmax(v->size, hi[c] - lo[c]);
+    for (int k = 0; k < b->pins; k++)
+        for (int i = 0; i < b->pin[k].nodes; i++)
+            for (int c = 0; c < v->dim; c++)
+                v->held[b->pin[k].node[i] * v->dim + c] |= b->pin[k].axes >> c & 1;
+}
+
+static int neural_take_handles(neural *v) {
+    unsigned char *of = (unsigned char *)need((size_t)v->nodes, 1);
+    int ok = 1;
+    for (int k = 0; ok && k < v->d->script.handles; k++) {
+        const scene_handle *h = &v->d->script.handle[k];
+        for (int i = 0; ok && i < h->nodes; i++) {
+            if (of[h->node[i]])
+                ok = fail(v->r, "%s: neural.script.handles[%d]: node %d is in handles[%d] too", v->r->o.scene,
+                          k, h->node[i], of[h->node[i]] - 1);
+            of[h->node[i]] = (unsigned char)(k + 1);
+            v->handle[v->handles++] = h->node[i];
+            for (int c = 0; c < v->dim; c++) v->held[h->node[i] * v->dim + c] = 1;
+        }
+    }
+    free(of);
+    return ok;
+}
+
+static tss_elements_def neural_elements(const neural *v) {
+    const tss_material *m = &v->r->s.body[0].material;
+    tss_elements_def d = tss_elements_def_default();
+    d.dim = v->dim, d.nodes = v->nodes, d.X = v->X, d.cells = v->cells, d.cell = v->cell;
+    d.E = m->E, d.nu = m->nu;
+    return d;
+}
+
+// A world of the scene with the learner's energy.
+static int neural_world(neural *v, tss_world **w) {
+    tss_material *m = &v->r->s.body[0].material;
+    tss_ipc *ipc;
+    m->kind = TSS_CUSTOM_MATERIAL, m->density = tss_neural_density;
+    m->user = v->lame, m->has_C = 1, m->barrier = 0;
+    return build_world(v->r, w, &ipc);
+}
+
+static int neural_open(run *r, neural *v) {
+    memset(v, 0, sizeof *v);
+    v->r = r, v->d = &r->s.neural, v->terminal = isatty(2);
+    v->deadline = r->o.minutes > 0 ? now(NULL) + 60 * r->o.minutes : INFINITY;
+    if (!read_scene(r) || !neural_check(r) || !make_folder(r, out_folder(r))) return 0;
+    tss_material *m = &r->s.body[0].material;
+    m->damping = 0;
+    v->lame[0] = m->E / (2 * (1 + m->nu)), v->lame[1] = m->E * m->nu / ((1 + m->nu) * (1 - 2 * m->nu));
+    neural_take_body(v);
+    if (!neural_take_handles(v) || !neural_world(v, &r->w)) return 0;
+    for (int i = 0; i < v->n; i++) v->mass[i] = tss_world_masses(r->w)[i / v->dim];
+    tss_elements_def d = neural_elements(v);
+    tss_host host = tss_host_default();
+    host.log = print_log, host.workers = r->o.threads;
+    if (tss_elements_create(&host, &d, &v->elements) != TSS_OK || tss_work_create(&host, &v->work) != TSS_OK)
+        return fail(r, "%s: the first body's mesh or material is not for neural.system", r->o.scene);
+    if (v->d->lipschitz.probes > v->d->r)
+        return fail(r, "%s: neural.lipschitz.probes is %d, expected at most neural.r (%d)", r->o.scene,
+                    v->d->lipschitz.probes, v->d->r);
+    return 1;
+}
+
+static void neural_close(neural *v) {
+    free(v->X), free(v->x0), free(v->mass), free(v->cell), free(v->held), free(v->handle), free(v->before);
+    free(v->train), free(v->test), free(v->B), free(v->A), free(v->code), free(v->code_test);
+    tss_elements_destroy(v->elements), tss_elements_destroy(v->cubature), tss_work_destroy(v->work);
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_script: what happens, at random. A sequence depends on its number and script.seed alone.
+// ---------------------------------------------------------------------------------------------
+
+typedef struct neural_script {
+    int length;
+    double *pose;  // length × handles × 6: translation, rotation
+    double *force;  // length × pulls × 3
+} neural_script;
+
+static int neural_hold(const neural *v, tss_rng *rng) {
+    int lo = (int)v->d->script.hold[0], hi = (int)v->d->script.hold[1];
+    return lo + (int)((hi - lo + 1) * tss_rng_uniform(rng));
+}
+
+// Handles walk from target to target on straight lines, all at once. Pulls come and go, each of its own.
+static neural_script neural_script_of(const neural *v, int sequence) {
+    const scene_neural *d = v->d;
+    int handles = d->script.handles, pulls = d->script.pulls, length = d->script.length;
+    tss_rng rng = tss_rng_seed((uint64_t)d->script.seed * 1000003u + (uint64_t)sequence);
+    neural_script s = {length, NULL, NULL};
+    s.pose = (double *)need((size_t)length * (size_t)handles * 6, sizeof(double));
+    s.force = (double *)need((size_t)length * (size_t)pulls * 3, sizeof(double));
+    double *from = (double *)need((size_t)handles * 12, sizeof(double)), *to = from + 6 * handles;
+    for (int at = 0; at < length && handles > 0;) {
+        int steps = neural_hold(v, &rng);
+        for (int k = 0; k < 6 * handles; k++) {
+            const scene_handle *h = &d->script.handle[k / 6];
+            const double(*box)[3] = k % 6 < 3 ? h->translate : h->rotate;
+            to[k] = box[0][k % 3] + (box[1][k % 3] - box[0][k % 3]) * tss_rng_uniform(&rng);
+        }
+        for (int j = 1; j <= steps && at < length; j++, at++)
+            for (int k = 0; k < 6 * handles; k++)
+                s.pose[6 * handles * at + k] = from[k] + (to[k] - from[k]) * j / steps;
+        memcpy(from, to, 6 * (size_t)handles * sizeof *to);
+    }
+    for (int k = 0; k < pulls; k++)
+        for (int at = 0, on = 1; at < length; on = !on) {
+            int steps = neural_hold(v, &rng);
+            double f[3];
+            for (int c = 0; c < 3; c++)
+                f[c] = on * d->script.pull[k].force[c] * (2 * tss_rng_uniform(&rng) - 1);
+            for (int j = 0; j < steps && at < length; j++, at++)
+                memcpy(s.force + 3 * (pulls * at + k), f, sizeof f);
+        }
+    free(from);
+    return s;
+}
+
+static void neural_script_free(neural_script *s) { free(s->pose), free(s->force); }
+
+// Where the handles' nodes are at step k: handles × dim, in the order of v->handle.
+static void neural_targets(const neural *v, const neural_script *s, int k, double *out) {
+    for (int q = 0, at = 0; q < v->d->script.handles; q++) {
+        const scene_handle *h = &v->d->script.handle[q];
+        const double *p = s->pose + 6 * (v->d->script.handles * k + q);
+        double mid[3] = {0, 0, 0}, lo[3], hi[3], R[9], from[3], to;
+        scene__turn(p + 3, R);
+        scene__box_empty(lo, hi);
+        for (int i = 0; i < h->nodes; i++)
+            for (int c = 0; c < v->dim; c++) {
+                lo[c] = fmin(lo[c], v->x0[v->dim * h->node[i] + c]);
+                hi[c] = fmax(hi[c], v->x0[v->dim * h->node[i] + c]);
+            }
+        for (int c = 0; c < v->dim; c++) mid[c] = 0.5 * (lo[c] + hi[c]);
+        for (int i = 0; i < h->nodes; i++, at++) {
+            for (int c = 0; c < 3; c++) from[c] = c < v->dim ? v->x0[v->dim * h->node[i] + c] - mid[c] : 0;
+            for (int c = 0; c < v->dim; c++) {
+                to = R[3 * c] * from[0] + R[3 * c + 1] * from[1] + R[3 * c + 2] * from[2];
+                out[v->dim * at + c] = mid[c] + to + p[c];
+            }
+        }
+    }
+}
+
+// Forces on the coordinates at step k, gravity among them if asked for: the world has its own.
+static void neural_forces(const neural *v, const neural_script *s, int k, int gravity, double *out) {
+    for (int i = 0; i < v->n; i++) out[i] = gravity ? v->mass[i] * v->r->s.world.gravity[i % v->dim] : 0;
+    for (int q = 0; q < v->d->script.pulls; q++) {
+        const scene_pull *p = &v->d->script.pull[q];
+        const double *f = s->force + 3 * (v->d->script.pulls * k + q);
+        for (int i = 0; i < p->nodes; i++)
+            for (int c = 0; c < v->dim; c++) out[v->dim * p->node[i] + c] += f[c] / p->nodes;
+    }
+}
+
+// Whether steps k − 2, k − 1, k go on evenly: Newton's method then starts from 2 x_t − x_{t−1}.
+static int neural_even(const neural *v, const neural_script *s, int k) {
+    int n = 6 * v->d->script.handles;
+    const double *p = s->pose + n * k;
+    for (int i = 0; i < n && k >= 2; i++)
+        if (fabs(p[i] - 2 * p[i - n] + p[i - 2 * n]) > 1e-9) return 0;
+    return k >= 2 && n > 0 && v->h == 0;
+}
+
+// Step k in full space. room: n.
+static int neural_full_step(neural *v, const neural_script *s, int k, double *room, tss_step_info *info) {
+    tss_result e = TSS_OK;
+    const double *x = tss_world_positions(v->r->w);
+    for (int i = 0; i < v->n; i++) {
+        room[i] = 2 * x[i] - v->before[i];
+        v->before[i] = x[i];
+    }
+    if (neural_even(v, s, k)) e = tss_body_teleport(v->r->w, 0, room, NULL);
+    neural_targets(v, s, k, room);
+    for (int i = 0; i < v->handles && e == TSS_OK; i++)
+        e = tss_node_target(v->r->w, v->handle[i], room + v->dim * i);
+    neural_forces(v, s, k, 0, room);
+    for (int q = 0; q < v->d->script.pulls; q++)
+        for (int i = 0; i < v->d->script.pull[q].nodes && e == TSS_OK; i++) {
+            int node = v->d->script.pull[q].node[i];
+            e = tss_node_force(v->r->w, node, room + v->dim * node);
+        }
+    if (e == TSS_OK) e = tss_world_step(v->r->w, info);
+    return e == TSS_OK ? 1 : fail(v->r, "%s: full space, step %d: %s", v->r->o.scene, k + 1, tss_world_error(v->r->w));
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_frames: DIR/frames.bin, 4 64-bit numbers (magic, hash of what the frames follow from,
+// coordinates, frames a sequence), then doubles. Sequence 0 .. test − 1 are tests, the rest trains.
+// ---------------------------------------------------------------------------------------------
+
+static uint64_t neural_hash(uint64_t h, const void *data, size_t bytes) {  // FNV-1a
+    const unsigned char *c = (const unsigned char *)data;
+    for (size_t i = 0; i < bytes; i++) h = (h ^ c[i]) * 1099511628211u;
+    return h;
+}
+
+static uint64_t neural_signature(const neural *v) {
+    const scene *s = &v->r->s;
+    uint64_t h = 14695981039346656037u;
+    size_t n = (size_t)v->n * sizeof(double);
+    h = neural_hash(neural_hash(neural_hash(h, v->X, n), v->x0, n), v->mass, n);
+    h = neural_hash(neural_hash(h, v->lame, sizeof v->lame), &v->h, sizeof v->h);
+    h = neural_hash(neural_hash(h, s->world.gravity, sizeof s->world.gravity), v->held, (size_t)v->n);
+    for (int k = 0; k < v->d->script.test; k += k ? k : 1) {  // the scripts themselves, of a few
+        neural_script q = neural_script_of(v, k);
+        h = neural_hash(h, q.pose, (size_t)q.length * (size_t)v->d->script.handles * 6 * sizeof(double));
+        h = neural_hash(h, q.force, (size_t)q.length * (size_t)v->d->script.pulls * 3 * sizeof(double));
+        neural_script_free(&q);
+    }
+    return h;
+}
+
+// Opens the file to append to; *done: whole sequences in it.
+static FILE *neural_frames_open(neural *v, int *done) {
+    char path[700];
+    uint64_t head[4] = {0x31534d4152465354u, neural_signature(v), (uint64_t)v->n, (uint64_t)v->d->script.length}, got[4];
+    size_t each = (size_t)v->n * (size_t)v->d->script.length * sizeof(double);
+    snprintf(path, sizeof path, "%s/frames.bin", v->r->o.out);
+    FILE *f = fopen(path, "r+b");
+    *done = 0;
+    if (f && fread(got, sizeof got, 1, f) == 1) {
+        if (memcmp(got, head, sizeof got) != 0) {
+            fail(v->r, "%s: frames of another scene or script; expected those of %s (choose another -o, or "
+                       "remove the file)", path, v->r->o.scene);
+            return fclose(f), (FILE *)NULL;
+        }
+        fseek(f, 0, SEEK_END);
+        *done = (int)(((size_t)ftell(f) - sizeof head) / each);
+        fseek(f, (long)(sizeof head + (size_t)*done * each), SEEK_SET);
+        return f;
+    }
+    if (f) fclose(f);
+    f = fopen(path, "w+b");
+    if (!f || fwrite(head, sizeof head, 1, f) != 1) {
+        fail(v->r, "%s: cannot be written: %s", path, strerror(errno));
+        if (f) fclose(f);
+        return NULL;
+    }
+    return f;
+}
+
+// The world's state before the first step of each sequence.
+typedef struct neural_start {
+    void *data;
+    size_t size;
+} neural_start;
+
+static int neural_sequence(neural *v, const neural_start *start, int number, double *out, int *failed) {
+    neural_script s = neural_script_of(v, number);
+    double *room = (double *)need((size_t)v->n, sizeof *room);
+    tss_step_info info;
+    int ok = load_world(v->r, v->r->w, start->data, start->size);
+    for (int k = 0; ok && k < s.length; k++) {
+        ok = neural_full_step(v, &s, k, room, &info);
+        if (ok) memcpy(out + (size_t)v->n * (size_t)k, tss_world_positions(v->r->w), (size_t)v->n * sizeof *out);
+        *failed += ok && info.status != TSS_STEP_CONVERGED;
+    }
+    free(room), neural_script_free(&s);
+    return ok;
+}
+
+// Frames of `test` and, if supervised, `train` sequences; 1 and v->stopped if the time is up before.
+static int neural_frames(neural *v) {
+    const scene_neural *d = v->d;
+    int done, failed = 0, wanted = d->script.test + (d->unsupervised ? 0 : d->script.train), ok = 1;
+    size_t each = (size_t)v->n * (size_t)d->script.length;
+    neural_start start = {NULL, 0};
+    FILE *f = neural_frames_open(v, &done);
+    if (!f) return 0;
+    double *room = (double *)need(each, sizeof *room), began = now(NULL);
+    int had = done;
+    start.data = save_world(v->r->w, &start.size);
+    for (; ok && done < wanted && !neural_late(v); done++) {
+        ok = neural_sequence(v, &start, done, room, &failed);
+        if (ok && (fwrite(room, sizeof *room, each, f) != each || fflush(f) != 0))
+            ok = fail(v->r, "%s/frames.bin: cannot be written: %s", v->r->o.out, strerror(errno));
+        double left = (now(NULL) - began) * (wanted - done - 1) / (done + 1 - had);
+        neural_progress(v, (done + 1.0) / wanted, "frames %d of %d, %d steps not converged, %.0f s left",
+                        (done + 1) * d->script.length, wanted * d->script.length, failed, left);
+    }
+    if (ok && done > had)
+        printf("frames: %d in %.1f s, %d steps not converged\n", (done - had) * d->script.length,
+               now(NULL) - began, failed);
+    if (ok && !v->stopped) {
+        v->tests = d->script.test * d->script.length, v->trains = (wanted - d->script.test) * d->script.length;
+        v->test = (double *)need((size_t)v->tests * (size_t)v->n, sizeof(double));
+        v->train = (double *)need((size_t)v->trains * (size_t)v->n, sizeof(double));
+        ok = fseek(f, 4 * (long)sizeof(uint64_t), SEEK_SET) == 0 &&
+             fread(v->test, sizeof(double) * (size_t)v->n, (size_t)v->tests, f) == (size_t)v->tests &&
+             fread(v->train, sizeof(double) * (size_t)v->n, (size_t)v->trains, f) == (size_t)v->trains;
+        if (!ok) fail(v->r, "%s/frames.bin: cannot be read", v->r->o.out);
+    }
+    fclose(f), free(room), free(start.data);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_basis: SVD of x − x0 in the mass norm, not centred, by the Gram matrix of some frames
+// ---------------------------------------------------------------------------------------------
+
+// Eigenvalues of symmetric a (m × m, destroyed) to its diagonal, vectors to the columns of e: Jacobi.
+static void neural_jacobi(int m, double *a, double *e) {
+    for (int i = 0; i < m * m; i++) e[i] = i % (m + 1) == 0;
+    for (int pass = 0; pass < 30; pass++) {
+        double off = 0, all = 0;
+        for (int i = 0; i < m * m; i++) all += a[i] * a[i], off += i % (m + 1) ? a[i] * a[i] : 0;
+        if (off <= 1e-28 * all) return;
+        for (int p = 0; p < m; p++)
+            for (int q = p + 1; q < m; q++) {
+                double g = a[p * m + q];
+                if (g * g <= 1e-34 * fabs(a[p * m + p] * a[q * m + q])) continue;
+                double tau = (a[q * m + q] - a[p * m + p]) / (2 * g);
+                double t = (tau >= 0 ? 1 : -1) / (fabs(tau) + sqrt(1 + tau * tau)), c = 1 / sqrt(1 + t * t), s = t * c;
+                double *ap = a + p * m, *aq = a + q * m, *ep = e + p * m, *eq = e + q * m;
+                for (int k = 0; k < m; k++) {  // rows; e holds vectors as rows
+                    double u = ap[k], w = aq[k], x = ep[k], y = eq[k];
+                    ap[k] = c * u - s * w, aq[k] = s * u + c * w;
+                    ep[k] = c * x - s * y, eq[k] = s * x + c * y;
+                }
+                for (int k = 0; k < m; k++) {
+                    double u = a[k * m + p], w = a[k * m + q];
+                    a[k * m + p] = c * u - s * w, a[k * m + q] = s * u + c * w;
+                }
+            }
+    }
+}
+
+// Mode k of the chosen frames, M-orthonormal, to u (n); 0: there is none.
+static int neural_mode(const neural *v, int m, const double *value, const double *vector, const int *order,
+                       int k, double *u) {
+    double l = k < m ? value[order[k] * (m + 1)] : 0;
+    if (!(l > 1e-14 * value[order[0] * (m + 1)])) return 0;
+    memset(u, 0, (size_t)v->n * sizeof *u);
+    for (int i = 0; i < m; i++) {
+        const double *x = v->train + (size_t)v->n * (size_t)((long)i * v->trains / m);
+        double w = vector[order[k] * m + i] / sqrt(l);
+        for (int j = 0; j < v->n; j++) u[j] += w * (x[j] - v->x0[j]);
+    }
+    return 1;
+}
+
+// What is left of each frame without its part along u; returns the farthest node's distance.
+static double neural_deflate(const neural *v, const double *u, double *rest) {
+    double most = 0;
+    for (int f = 0; f < v->trains; f++) {
+        double *x = rest + (size_t)v->n * (size_t)f, c = 0;
+        for (int j = 0; j < v->n; j++) c += v->mass[j] * u[j] * x[j];
+        for (int i = 0; i < v->nodes; i++) {
+            double s = 0;
+            for (int j = v->dim * i; j < v->dim * (i + 1); j++) x[j] -= c * u[j], s += x[j] * x[j];
+            most = fmax(most, s);
+        }
+    }
+    return sqrt(most);
+}
+
+static double *neural_encode_frames(const neural *v, const double *x, int count) {
+    double *c = (double *)need((size_t)count * (size_t)v->p, sizeof *c);
+    double *off = (double *)need((size_t)v->n, sizeof *off);
+    for (int f = 0; f < count; f++) {
+        for (int j = 0; j < v->n; j++) off[j] = x[(size_t)v->n * (size_t)f + (size_t)j] - v->x0[j];
+        for (int j = 0; j < v->n; j++)
+            for (int k = 0; k < v->p; k++) c[(size_t)f * (size_t)v->p + (size_t)k] += off[j] * v->A[(size_t)j * (size_t)v->p + (size_t)k];
+    }
+    free(off);
+    return c;
+}
+
+// u (modes × n) → B and A, with the unit in which frames have a mean square of 1.
+static void neural_basis_take(neural *v, const double *u) {
+    double s = 0;
+    for (int f = 0; f < v->trains; f++)
+        for (int j = 0; j < v->n; j++) {
+            double d = v->train[(size_t)v->n * (size_t)f + (size_t)j] - v->x0[j];
+            s += v->mass[j] * d * d / v->trains;
+        }
+    s = sqrt(s);
+    v->B = (double *)need((size_t)v->n * (size_t)v->p, sizeof(double));
+    v->A = (double *)need((size_t)v->n * (size_t)v->p, sizeof(double));
+    for (int j = 0; j < v->n; j++)
+        for (int k = 0; k < v->p; k++) {
+            double b = u[(size_t)k * (size_t)v->n + (size_t)j];
+            v->B[(size_t)j * (size_t)v->p + (size_t)k] = s * b;
+            v->A[(size_t)j * (size_t)v->p + (size_t)k] = v->mass[j] * b / s;
+        }
+}
+
+static int neural_value_order(int m, const double *value, int *order) {
+    for (int i = 0; i < m; i++) {
+        int at = i;
+        for (; at > 0 && value[order[at - 1] * (m + 1)] < value[i * (m + 1)]; at--) order[at] = order[at - 1];
+        order[at] = i;
+    }
+    return m;
+}
+
+static int neural_basis(neural *v) {
+    int m = v->trains < NEURAL_SNAPSHOTS ? v->trains : NEURAL_SNAPSHOTS;
+    size_t n = (size_t)v->n, mm = (size_t)m * (size_t)m;
+    double *D = (double *)need((size_t)m * n, sizeof *D), *K = (double *)need(mm, sizeof *K), *E = (double *)need(mm, sizeof *E);
+    double *rest = (double *)need((size_t)v->trains * n, sizeof *rest), *u = (double *)need((size_t)v->d->pca.most * n, sizeof *u);
+    int *order = (int *)need((size_t)m, sizeof *order);
+    double began = now(NULL);
+    for (size_t i = 0; i < (size_t)v->trains * n; i++) rest[i] = v->train[i] - v->x0[i % n];
+    for (int i = 0; i < m; i++)
+        for (size_t j = 0; j < n; j++)
+            D[(size_t)i * n + j] = sqrt(v->mass[j]) * rest[(size_t)((long)i * v->trains / m) * n + j];
+    tss_dense_product(1, 0, m, m, v->n, 1, D, v->n, D, v->n, 0, K, m);
+    neural_jacobi(m, K, E);
+    neural_value_order(m, K, order);
+    v->left = INFINITY;
+    while (v->p < v->d->pca.most && v->left > v->d->pca.tol && neural_mode(v, m, K, E, order, v->p, u + (size_t)v->p * n)) {
+        v->left = neural_deflate(v, u + (size_t)v->p * n, rest) / v->size;
+        v->p++;
+    }
+    if (v->p >= v->d->r) neural_basis_take(v, u);
+    free(D), free(K), free(E), free(rest), free(u), free(order);
+    if (v->p < v->d->r)
+        return fail(v->r, "%s: the frames span %d modes, expected at least neural.r (%d)", v->r->o.scene, v->p, v->d->r);
+    v->code = neural_encode_frames(v, v->train, v->trains), v->code_test = neural_encode_frames(v, v->test, v->tests);
+    printf("basis: %d modes of %d frames, farthest node %.3g of the size, %.1f s\n", v->p, v->trains, v->left, now(NULL) - began);
+    return 1;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_networks
+// ---------------------------------------------------------------------------------------------
+
+static int neural_net(neural *v, int in, int out, uint64_t seed, const tss_net_def *maps, tss_net **net) {
+    int width[SCENE_HIDDEN + 2];
+    tss_net_def d = *maps;
+    width[0] = in, width[v->d->layers + 1] = out;
+    memcpy(width + 1, v->d->hidden, (size_t)v->d->layers * sizeof *width);
+    d.layers = v->d->layers + 1, d.width = width, d.activation = (tss_activation)v->d->activation, d.seed = seed;
+    return tss_net_create(NULL, &d, net) == TSS_OK ? 1 : fail(v->r, "%s: neural.hidden: out of memory", v->r->o.scene);
+}
+
+// The free coordinates that an unsupervised decoder moves. Returns how many.
+static int neural_free(const neural *v, int *index) {
+    int n = 0;
+    for (int i = 0; i < v->n; i++)
+        if (!v->held[i]) index[n++] = i;
+    return n;
+}
+
+static int neural_fresh(neural *v, tss_model *m) {
+    uint64_t seed = 2 * (uint64_t)v->r->o.seed;
+    tss_net_def d = tss_net_def_default();
+    int ok = 1;
+    d.outputs = v->n, d.out_base = v->x0;
+    m->rng = tss_rng_seed(seed + 1000);
+    if (v->d->unsupervised) {
+        int *index = (int *)need((size_t)v->n, sizeof *index), free_count = neural_free(v, index);
+        d.out_index = index;
+        ok = neural_net(v, v->d->r, free_count, seed, &d, &m->decoder);
+        free(index);
+        return ok;
+    }
+    d.out_matrix = v->B;
+    if (!neural_net(v, v->d->r, v->p, seed, &d, &m->decoder)) return 0;
+    d = tss_net_def_default();
+    d.inputs = v->n, d.in_base = v->x0, d.in_matrix = v->A;
+    return neural_net(v, v->p, v->d->r, seed + 1, &d, &m->encoder);
+}
+
+static size_t neural_parameters(const tss_net *net) {
+    tss_net_info i;
+    if (!net) return 0;
+    tss_net_get_info(net, &i);
+    return i.parameters;
+}
+
+static void neural_path(const neural *v, neural_phase phase, char path[700]) {
+    snprintf(path, 700, "%s/%s_%d.tssn", v->r->o.out, neural_phases[phase], v->r->o.seed);
+}
+
+// A model of this scene; *there = 0: no file.
+static int neural_read(neural *v, neural_phase phase, tss_model *m, int *there) {
+    char path[700], why[300] = "";
+    tss_net_info i;
+    neural_path(v, phase, path);
+    memset(m, 0, sizeof *m);
+    *there = access(path, F_OK) == 0;
+    if (!*there) return 1;
+    if (tss_model_read(NULL, path, m, why, sizeof why) != TSS_OK) return fail(v->r, "%s: %s", path, why);
+    tss_net_get_info(m->decoder, &i);
+    int same = i.inputs == v->d->r && i.outputs == v->n && i.layers == v->d->layers + 1 &&
+               i.activation == (tss_activation)v->d->activation && (m->encoder == NULL) == v->d->unsupervised &&
+               (v->d->unsupervised || v->p == 0 || i.width[i.layers] == v->p);
+    for (int k = 0; same && k < v->d->layers; k++) same = i.width[k + 1] == v->d->hidden[k];
+    if (same) return 1;
+    tss_model_free(m);
+    return fail(v->r, "%s: a network of another scene; expected that of %s (choose another -o, or remove the file)",
+                path, v->r->o.scene);
+}
+
+// z of frames (count × n): encoded; unsupervised: N(0, I).
+static double *neural_z(neural *v, const tss_model *m, const double *x, int count) {
+    double *z = (double *)need((size_t)count * (size_t)v->d->r, sizeof *z);
+    tss_rng rng = tss_rng_seed(12345);
+    if (m->encoder) {
+        (void)tss_net_forward(m->encoder, v->work, count, x, z);
+        return z;
+    }
+    for (int i = 0; i < count * v->d->r; i++) z[i] = tss_rng_normal(&rng);
+    return z;
+}
+
+// Every so many frames, count of them.
+static double *neural_spread(const neural *v, const double *x, int frames, int count) {
+    double *out = (double *)need((size_t)count * (size_t)v->n, sizeof *out);
+    for (int k = 0; k < count && frames > 0; k++)
+        memcpy(out + (size_t)k * (size_t)v->n, x + (size_t)((long)k * frames / count) * (size_t)v->n, (size_t)v->n * sizeof *out);
+    return out;
+}
+
+static int neural_cubature(neural *v, const tss_model *base, double *seconds) {
+    const scene_neural *d = v->d;
+    double began = now(NULL), error;
+    int count, ok;
+    if (d->lipschitz.cubature == 0 || d->lipschitz.cubature >= v->cells) return 1;
+    double *x = neural_spread(v, v->train, v->trains, d->lipschitz.samples);
+    double *z = neural_z(v, base, x, d->lipschitz.samples);
+    int *subset = (int *)need((size_t)d->lipschitz.cubature, sizeof *subset);
+    double *weight = (double *)need((size_t)d->lipschitz.cubature, sizeof *weight);
+    tss_cubature_def c = tss_cubature_def_default();
+    c.count = d->lipschitz.cubature, c.seed = (uint64_t)v->r->o.seed;
+    tss_result e = tss_cubature_select(base->decoder, v->elements, v->work, &c, d->lipschitz.samples, z, subset, weight, &count, &error);
+    tss_elements_def ed = neural_elements(v);
+    ed.count = count, ed.subset = subset, ed.weight = weight;
+    if (e == TSS_OK) e = tss_elements_create(NULL, &ed, &v->cubature);
+    ok = e == TSS_OK ? 1 : fail(v->r, "%s: neural.lipschitz.cubature: %s", v->r->o.scene, tss_result_text(e));
+    *seconds = now(NULL) - began;
+    if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", count, v->cells, error, *seconds);
+    free(x), free(z), free(subset), free(weight);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_training
+// ---------------------------------------------------------------------------------------------
+
+typedef struct neural_trainer {
+    neural *v;
+    neural_phase phase;
+    tss_model m;
+    uint64_t first, last;  // steps of the phase: from, to
+    tss_net *decoder, *encoder;  // the MLPs alone: c of z, z of c. Supervised
+    tss_training *t;             // unsupervised
+    double *g, *c, *c2, *z, *z_bar, *z_mean, *probe, *z_test;
+    double loss, lipschitz, lip, rate;  // running means of the losses
+    double seconds;
+    int skipped;
+    FILE *rows;
+} neural_trainer;
+
+static tss_adam_def neural_adam(const neural_trainer *t) {
+    const scene_neural *d = t->v->d;
+    int base = t->phase == NEURAL_BASE, steps = base ? d->train.steps : d->lipschitz.steps;
+    double end = base ? d->train.rate_end : d->lipschitz.rate_end;
+    tss_adam_def a = tss_adam_def_default();
+    a.rate = base ? d->train.rate : d->lipschitz.rate, a.warmup = (uint64_t)(base ? d->train.warmup : d->lipschitz.warmup);
+    a.decay_every = steps >= 200 ? (uint64_t)steps / 200 : 1;
+    a.decay = pow(end / a.rate, (double)a.decay_every / steps);
+    return a;
+}
+
+static tss_lipschitz_def neural_lipschitz(const neural *v) {
+    tss_lipschitz_def d = tss_lipschitz_def_default();
+    d.order = v->d->lipschitz.order, d.undivided = v->d->lipschitz.undivided;
+    d.estimator = d.order == 2 ? (tss_estimator)v->d->lipschitz.estimator : TSS_LIPSCHITZ_EXACT;
+    d.probes = v->d->lipschitz.probes;
+    return d;
+}
+
+static void neural_draw(const neural *v, tss_rng *rng, int count, double *c) {
+    for (int k = 0; k < count; k++) {
+        int f = (int)(tss_rng_uniform(rng) * v->trains);
+        memcpy(c + (size_t)k * (size_t)v->p, v->code + (size_t)f * (size_t)v->p, (size_t)v->p * sizeof *c);
+    }
+}
+
+// Root mean square of z about its mean: the unit that Eq. 7 is in.
+static double neural_z_scale(const double *z, int count, int r, double *mean) {
+    double s = 0;
+    for (int k = 0; k < r; k++) {
+        mean[k] = 0;
+        for (int i = 0; i < count; i++) mean[k] += z[i * r + k] / count;
+        for (int i = 0; i < count; i++) s += (z[i * r + k] - mean[k]) * (z[i * r + k] - mean[k]) / ((double)count * r);
+    }
+    return sqrt(s);
+}
+
+// L_LS of a batch of frames of their own; its gradient is added to g. lipschitz.relative: L_LS is
+// multiplied by s^(2(o + 1)), s the spread of the batch's z: else it falls when z is but stretched.
+static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double *loss) {
+    neural *v = t->v;
+    const scene_neural *d = v->d;
+    size_t dec = neural_parameters(t->decoder);
+    tss_lipschitz_def ld = neural_lipschitz(v);
+    int batch = d->lipschitz.batch, r = d->r;
+    neural_draw(v, &t->m.rng, batch, t->c2);
+    for (int i = 0; i < 2 * r * ld.probes && ld.estimator != TSS_LIPSCHITZ_EXACT; i++) t->probe[i] = tss_rng_normal(&t->m.rng);
+    memset(t->z_bar, 0, (size_t)batch * (size_t)r * sizeof *t->z_bar);
+    tss_result e = tss_net_forward(t->encoder, v->work, batch, t->c2, t->z);
+    double spread = d->lipschitz.relative ? neural_z_scale(t->z, batch, r, t->z_mean) : 1;
+    double power = 2 * (ld.order + 1), unit = pow(spread, power);
+    weight *= unit;
+    if (e == TSS_OK)
+        e = tss_loss_lipschitz(t->m.decoder, v->cubature ? v->cubature : v->elements, v->work, &ld, batch, t->z,
+                               ld.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe, weight, loss, t->g,
+                               d->lipschitz.through_encoder ? t->z_bar : NULL);
+    for (int i = 0; d->lipschitz.relative && i < batch * r; i++)
+        t->z_bar[i] += weight * *loss * power * (t->z[i] - t->z_mean[i % r]) / (batch * r * spread * spread);
+    *loss *= unit;
+    if (e == TSS_OK && d->lipschitz.through_encoder)
+        e = tss_net_backward(t->encoder, v->work, batch, t->c2, t->z_bar, t->g + dec, NULL);
+    return e;
+}
+
+static void neural_sync(neural_trainer *t) {
+    memcpy(tss_net_parameters(t->decoder), tss_net_parameters(t->m.decoder), neural_parameters(t->decoder) * sizeof(double));
+    memcpy(tss_net_parameters(t->encoder), tss_net_parameters(t->m.encoder), neural_parameters(t->encoder) * sizeof(double));
+}
+
+// One step of Eq. 10 on frames. The model holds whole maps; Eq. 3 is taken in c.
+static tss_result neural_step(neural_trainer *t, tss_training_info *info) {
+    neural *v = t->v;
+    size_t dec = neural_parameters(t->decoder), enc = neural_parameters(t->encoder);
+    double weight = t->phase == NEURAL_LIPSCHITZ ? v->d->lipschitz.weight : 0;
+    memset(info, 0, sizeof *info);
+    memset(t->g, 0, (dec + enc) * sizeof *t->g);
+    neural_draw(v, &t->m.rng, v->d->train.batch, t->c);
+    tss_result e = tss_loss_reconstruction(t->decoder, t->encoder, v->work, NULL, v->d->train.batch, t->c, 1, &info->loss, t->g, t->g + dec);
+    if (e == TSS_OK && weight > 0) e = neural_step_lipschitz(t, weight, &info->lipschitz);
+    for (size_t i = 0; i < dec + enc; i++) info->skipped |= !isfinite(t->g[i]);
+    info->rate = tss_adam_rate(t->m.adam);
+    t->m.step++;
+    if (e != TSS_OK || info->skipped) return e;
+    tss_adam_update(t->m.adam, 0, dec, tss_net_parameters(t->m.decoder), t->g);
+    tss_adam_update(t->m.adam, dec, enc, tss_net_parameters(t->m.encoder), t->g + dec);
+    tss_adam_advance(t->m.adam);
+    neural_sync(t);
+    return e;
+}
+
+static int neural_trainer_supervised(neural_trainer *t) {
+    neural *v = t->v;
+    tss_net_def plain = tss_net_def_default();
+    size_t r = (size_t)v->d->r, p = (size_t)v->p, batch = (size_t)v->d->lipschitz.batch;
+    if (!neural_net(v, v->d->r, v->p, 0, &plain, &t->decoder) || !neural_net(v, v->p, v->d->r, 0, &plain, &t->encoder)) return 0;
+    neural_sync(t);
+    t->g = (double *)need(neural_parameters(t->decoder) + neural_parameters(t->encoder), sizeof(double));
+    t->c = (double *)need((size_t)v->d->train.batch * p, sizeof(double)), t->c2 = (double *)need(batch * p, sizeof(double));
+    t->z = (double *)need(batch * r, sizeof(double)), t->z_bar = (double *)need(batch * r, sizeof(double));
+    t->z_mean = (double *)need(r, sizeof(double));
+    t->probe = (double *)need(2 * r * (size_t)v->d->lipschitz.probes, sizeof(double));
+    return 1;
+}
+
+static int neural_trainer_unsupervised(neural_trainer *t) {
+    neural *v = t->v;
+    const scene_neural *d = v->d;
+    tss_training_def td = tss_training_def_default();
+    td.model = &t->m, td.elements = v->elements, td.cubature = v->cubature, td.mass = v->mass;
+    td.batch = d->train.batch, td.lambda = d->train.lambda, td.sigma = d->train.sigma, td.eps = d->train.eps;
+    td.ramp = (uint64_t)d->train.ramp, td.lipschitz_from = t->first, td.lipschitz_batch = d->lipschitz.batch;
+    td.lipschitz_weight = t->phase == NEURAL_LIPSCHITZ ? d->lipschitz.weight : 0, td.lipschitz = neural_lipschitz(v);
+    td.adam = neural_adam(t);
+    tss_host host = tss_host_default();
+    host.log = print_log, host.workers = v->r->o.threads;
+    return tss_training_create(&host, &td, &t->t) == TSS_OK ? 1 : fail(v->r, "%s: neural.train: the library refuses it", v->r->o.scene);
+}
+
+// Seconds that earlier runs spent up to this step.
+static double neural_spent(const neural *v, neural_phase phase, uint64_t step) {
+    char path[700], line[300], name[32];
+    double seconds = 0, s;
+    unsigned long long at;
+    snprintf(path, sizeof path, "%s/train_%d.csv", v->r->o.out, v->r->o.seed);
+    FILE *f = fopen(path, "r");
+    while (f && fgets(line, sizeof line, f))
+        if (sscanf(line, "%31[^,],%llu,%lf", name, &at, &s) == 3 && strcmp(name, neural_phases[phase]) == 0 && at <= step)
+            seconds = s;
+    if (f) fclose(f);
+    return seconds;
+}
+
+static int neural_rows_open(neural_trainer *t) {
+    char path[700];
+    snprintf(path, sizeof path, "%s/train_%d.csv", t->v->r->o.out, t->v->r->o.seed);
+    int old = access(path, F_OK) == 0;
+    t->rows = fopen(path, "a");
+    if (!t->rows) return fail(t->v->r, "%s: cannot be written: %s", path, strerror(errno));
+    if (!old) fputs("phase,step,seconds,loss,loss_lipschitz,lip,z_scale,rate,skipped\n", t->rows);
+    return 1;
+}
+
+// The phase's model: its own file; else a new one, or the base with an optimiser at its start.
+static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t) {
+    int there;
+    memset(t, 0, sizeof *t);
+    t->v = v, t->phase = phase;
+    t->first = phase == NEURAL_BASE ? 0 : (uint64_t)v->d->train.steps;
+    t->last = t->first + (uint64_t)(phase == NEURAL_BASE ? v->d->train.steps : v->d->lipschitz.steps);
+    tss_adam_def a = neural_adam(t);
+    if (!neural_read(v, phase, &t->m, &there)) return 0;
+    if (!there && phase == NEURAL_BASE && !neural_fresh(v, &t->m)) return 0;
+    if (!there && phase != NEURAL_BASE) {
+        if (!neural_read(v, NEURAL_BASE, &t->m, &there)) return 0;
+        if (tss_adam_set(t->m.adam, &a, 1) != TSS_OK) return fail(v->r, "%s: neural.lipschitz: bad rates", v->r->o.scene);
+    }
+    size_t all = neural_parameters(t->m.decoder) + neural_parameters(t->m.encoder);
+    if (!t->m.adam && tss_adam_create(NULL, &a, all, &t->m.adam) != TSS_OK) return fail(v->r, "out of memory");
+    t->seconds = neural_spent(v, phase, t->m.step);
+    t->z_test = neural_spread(v, v->test, v->tests, NEURAL_SAMPLES);
+    return (v->d->unsupervised ? neural_trainer_unsupervised(t) : neural_trainer_supervised(t)) && neural_rows_open(t);
+}
+
+static void neural_trainer_close(neural_trainer *t) {
+    tss_model_free(&t->m);
+    tss_training_destroy(t->t), tss_net_destroy(t->decoder), tss_net_destroy(t->encoder);
+    free(t->g), free(t->c), free(t->c2), free(t->z), free(t->z_bar), free(t->z_mean), free(t->probe), free(t->z_test);
+    if (t->rows) fclose(t->rows);
+}
+
+// The model to its file, and a row of the curves.
+static int neural_checkpoint(neural_trainer *t) {
+    neural *v = t->v;
+    char path[700];
+    double *z = neural_z(v, &t->m, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
+    const tss_elements *e = v->cubature ? v->cubature : v->elements;
+    (void)tss_lipschitz_estimate(t->m.decoder, e, v->work, 2, NEURAL_SAMPLES, z, &t->lip);
+    fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
+            t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped);
+    fflush(t->rows), free(z), free(mean);
+    neural_path(v, t->phase, path);
+    tss_result r = tss_model_write(NULL, &t->m, path);
+    return r == TSS_OK ? 1 : fail(v->r, "%s: cannot be written: %s", path, tss_result_text(r));
+}
+
+static int neural_train_loop(neural_trainer *t) {
+    neural *v = t->v;
+    tss_training_info i;
+    uint64_t every = (t->last - t->first) / 40 + 1, begun = t->m.step;
+    double start = now(NULL), before = t->seconds, saved = start;
+    while (t->m.step < t->last && !neural_late(v)) {
+        tss_result e = t->t ? tss_training_step(t->t, &i) : neural_step(t, &i);
+        if (e != TSS_OK) return fail(v->r, "%s: training: %s", v->r->o.scene, tss_result_text(e));
+        double share = t->m.step == begun + 1 ? 1 : 0.01;
+        t->loss += share * (i.loss - t->loss), t->lipschitz += share * (i.lipschitz - t->lipschitz);
+        t->rate = i.rate, t->skipped += i.skipped;
+        double spent = now(NULL) - start;
+        t->seconds = before + spent;
+        if ((t->m.step - t->first) % every == 0 || now(NULL) > saved + 60) {
+            if (!neural_checkpoint(t)) return 0;
+            saved = now(NULL);
+        }
+        neural_progress(v, (double)(t->m.step - t->first) / (double)(t->last - t->first),
+                        "%s %llu of %llu: loss %.4g, L_LS %.4g, Lip %.4g, %.0f s left", neural_phases[t->phase],
+                        (unsigned long long)(t->m.step - t->first), (unsigned long long)(t->last - t->first), t->loss,
+                        t->lipschitz, t->lip, spent / (double)(t->m.step - begun) * (double)(t->last - t->m.step));
+    }
+    return t->m.step == begun || neural_checkpoint(t);
+}
+
+static int neural_train_phase(neural *v, neural_phase phase) {
+    neural_trainer t;
+    int ok = neural_trainer_open(v, phase, &t) && neural_train_loop(&t);
+    if (ok && t.loss > 0)
+        printf("%s: step %llu, %.1f s, loss %.6g, Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds, t.loss, t.lip);
+    fflush(stdout);
+    neural_trainer_close(&t);
+    return ok;
+}
+
+static int neural_train(neural *v) {
+    const char *only = v->r->o.method;
+    double seconds = 0;
+    tss_model base;
+    int there;
+    if (!neural_frames(v) || v->stopped) return !v->r->why.text[0];
+    if (!v->d->unsupervised && !neural_basis(v)) return 0;
+    if (!neural_train_phase(v, NEURAL_BASE) || v->stopped) return !v->r->why.text[0];
+    if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
+    int ok = neural_cubature(v, &base, &seconds);
+    tss_model_free(&base);
+    if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
+    if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_trial: the test sequences in full space and in the subspaces, side by side
+// ---------------------------------------------------------------------------------------------
+
+enum { NEURAL_TRIAL_VANILLA, NEURAL_TRIAL_LIPSCHITZ, NEURAL_TRIAL_LINEAR, NEURAL_TRIAL_FULL, NEURAL_TRIALS };
+static const char *const neural_trial_names[] = {"vanilla", "lipschitz", "linear", "full"};
+
+typedef struct neural_entry {
+    int used;
+    tss_model m;
+    tss_reduced *s;
+    // Of each step of the tests: s (the shortest of --repeat), counts, exit, and what remains of the
+    // gradient, J; distance from full space over the diagonal, of all nodes and the farthest.
+    double *seconds, *gradient, *energy, *mean, *farthest;
+    int *iterations, *evaluations, *exit;
+    // Distance of the tests' states from the nearest that the decoder reaches, over the diagonal.
+    double projection_mean, projection_farthest;
+    double lip, z_scale, train_seconds;  // Eq. 7; spread of z: lip · spread³ does not see z stretched
+} neural_entry;
+
+typedef struct neural_trial {
+    neural *v;
+    neural_entry e[NEURAL_TRIALS];
+    int steps;
+    double diagonal, *room, *force, *target;
+} neural_trial;
+
+// The best r modes of the frames.
+static int neural_linear(neural *v, tss_model *m) {
+    int r = v->d->r, width[2] = {r, r};
+    double *B = (double *)need((size_t)v->n * (size_t)r, sizeof *B);
+    tss_net_def d = tss_net_def_default();
+    for (int j = 0; j < v->n; j++)
+        for (int k = 0; k < r; k++) B[j * r + k] = v->B[(size_t)j * (size_t)v->p + (size_t)k];
+    d.layers = 1, d.width = width, d.outputs = v->n, d.out_base = v->x0, d.out_matrix = B;
+    tss_result e = tss_net_create(NULL, &d, &m->decoder);
+    free(B);
+    if (e != TSS_OK) return fail(v->r, "out of memory");
+    double *theta = tss_net_parameters(m->decoder);
+    for (int i = 0; i < r * r + r; i++) theta[i] = i < r * r && i % (r + 1) == 0;
+    return 1;
+}
+
+static int neural_entry_open(neural_trial *t, int which) {
+    neural *v = t->v;
+    neural_entry *e = &t->e[which];
+    const scene_neural *d = v->d;
+    size_t steps = (size_t)t->steps;
+    int there = 1;
+    e->seconds = (double *)need(5 * steps, sizeof(double)), e->gradient = e->seconds + steps;
+    e->energy = e->gradient + steps, e->mean = e->energy + steps, e->farthest = e->mean + steps;
+    e->iterations = (int *)need(3 * steps, sizeof(int)), e->evaluations = e->iterations + steps, e->exit = e->evaluations + steps;
+    for (size_t k = 0; k < steps; k++) e->seconds[k] = INFINITY;
+    if (which == NEURAL_TRIAL_FULL) return e->used = 1;
+    if (which == NEURAL_TRIAL_LINEAR && d->unsupervised) return 1;
+    neural_phase phase = which == NEURAL_TRIAL_VANILLA ? NEURAL_VANILLA : NEURAL_LIPSCHITZ;
+    if (which == NEURAL_TRIAL_LINEAR ? !neural_linear(v, &e->m) : !neural_read(v, phase, &e->m, &there)) return 0;
+    if (!there)
+        return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
+                    v->r->o.seed, v->r->o.scene);
+    tss_reduced_def rd = tss_reduced_def_default();
+    rd.decoder = e->m.decoder, rd.elements = v->elements, rd.mass = v->mass, rd.h = v->h;
+    rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
+    rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+    tss_host host = tss_host_default();
+    host.log = print_log, host.workers = v->r->o.threads;
+    e->used = 1;
+    if (which != NEURAL_TRIAL_LINEAR)
+        e->train_seconds = neural_spent(v, NEURAL_BASE, (uint64_t)d->train.steps) + neural_spent(v, phase, e->m.step);
+    return tss_reduced_create(&host, &rd, &e->s) == TSS_OK ? 1 : fail(v->r, "%s: neural.solver is refused", v->r->o.scene);
+}
+
+static int neural_trial_open(neural *v, neural_trial *t) {
+    double lo[3], hi[3];
+    memset(t, 0, sizeof *t);
+    t->v = v;
+    if (!neural_frames(v)) return 0;
+    if (v->stopped) return fail(v->r, "%s/frames.bin: not all frames are there yet", v->r->o.out);
+    if (!v->d->unsupervised && !neural_basis(v)) return 0;
+    t->steps = v->d->script.test * (v->d->script.length / v->d->script.stride);
+    if (v->d->script.stride > v->d->script.length || (v->h > 0 && v->d->script.stride > 1))
+        return fail(v->r, "%s: neural.script.stride is %d, expected at most length (%d), and 1 unless quasi-static", v->r->o.scene,
+                    v->d->script.stride, v->d->script.length);
+    t->room = (double *)need(3 * (size_t)v->n, sizeof(double)), t->force = t->room + v->n, t->target = t->force + v->n;
+    scene__box_empty(lo, hi);
+    for (int i = 0; i < v->n; i++)
+        lo[i % v->dim] = fmin(lo[i % v->dim], v->X[i]), hi[i % v->dim] = fmax(hi[i % v->dim], v->X[i]);
+    for (int c = 0; c < v->dim; c++) t->diagonal += (hi[c] - lo[c]) * (hi[c] - lo[c]);
+    t->diagonal = sqrt(t->diagonal);
+    for (int k = 0; k < NEURAL_TRIALS; k++)
+        if (!neural_entry_open(t, k)) return 0;
+    return 1;
+}
+
+static void neural_trial_close(neural_trial *t) {
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m);
+        free(t->e[k].seconds), free(t->e[k].iterations);
+    }
+    free(t->room);
+}
+
+// ‖x − y‖ of the nodes over the diagonal: the mean, and the farthest.
+static void neural_distance(const neural_trial *t, const double *x, const double *y, double *mean, double *farthest_) {
+    const neural *v = t->v;
+    *mean = *farthest_ = 0;
+    for (int i = 0; i < v->nodes; i++) {
+        double s = 0;
+        for (int j = v->dim * i; j < v->dim * (i + 1); j++) s += (x[j] - y[j]) * (x[j] - y[j]);
+        *mean += sqrt(s) / (v->nodes * t->diagonal), *farthest_ = fmax(*farthest_, sqrt(s) / t->diagonal);
+    }
+}
+
+// Step k of a sequence by one subspace; `at`: of all test steps. Seconds include decoding.
+static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
+    neural *v = t->v;
+    tss_reduced_info i;
+    double began = now(NULL);
+    tss_result r = tss_reduced_set_handles(e->s, v->handles, v->handle, t->target);
+    tss_reduced_set_force(e->s, t->force);
+    if (r == TSS_OK) r = tss_reduced_step(e->s, &i);
+    if (r != TSS_OK) return fail(v->r, "%s: test step %d: %s", v->r->o.scene, at + 1, tss_result_text(r));
+    const double *x = tss_reduced_x(e->s);
+    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began);
+    e->iterations[at] = i.iterations, e->evaluations[at] = i.evaluations, e->exit[at] = (int)i.exit;
+    e->gradient[at] = i.gradient, e->energy[at] = i.energy;
+    neural_distance(t, x, tss_world_positions(v->r->w), &e->mean[at], &e->farthest[at]);
+    return 1;
+}
+
+// Full space takes the script's steps one by one, up to and with step k.
+static int neural_trial_full(neural_trial *t, const neural_script *s, int k, int at) {
+    neural_entry *e = &t->e[NEURAL_TRIAL_FULL];
+    tss_step_info i;
+    double began = now(NULL);
+    e->iterations[at] = 0, e->exit[at] = TSS_EXIT_CONVERGED;
+    for (int q = k - t->v->d->script.stride + 1; q <= k; q++) {
+        if (!neural_full_step(t->v, s, q, t->room, &i)) return 0;
+        e->iterations[at] += i.newton;
+        if (i.status != TSS_STEP_CONVERGED) e->exit[at] = TSS_EXIT_ITERATIONS;
+    }
+    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began), e->evaluations[at] = e->iterations[at];
+    e->energy[at] = tss_elements_potential(t->v->elements, tss_world_positions(t->v->r->w), NULL);
+    return 1;
+}
+
+typedef int neural_watch(neural_trial *t, int sequence, int k, void *ctx);  // 0: fails
+
+static int neural_trial_sequence(neural_trial *t, int number, const neural_start *start, neural_watch *watch, void *ctx) {
+    neural *v = t->v;
+    neural_script s = neural_script_of(v, number);
+    int ok = load_world(v->r, v->r->w, start->data, start->size);
+    for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {
+        if (!t->e[q].used) continue;
+        (void)tss_reduced_set_handles(t->e[q].s, 0, NULL, NULL);
+        tss_result r = tss_reduced_project(t->e[q].s, v->x0, NULL);
+        if (r != TSS_OK) ok = fail(v->r, "%s: the start cannot be projected: %s", v->r->o.scene, tss_result_text(r));
+    }
+    int stride = v->d->script.stride;
+    for (int k = stride - 1; ok && k < s.length; k += stride) {
+        int at = number * (s.length / stride) + k / stride;
+        ok = neural_trial_full(t, &s, k, at);
+        neural_targets(v, &s, k, t->target), neural_forces(v, &s, k, 1, t->force);
+        for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {  // who is first takes turns
+            neural_entry *e = &t->e[(q + at) % NEURAL_TRIAL_FULL];
+            if (e->used) ok = neural_trial_step(t, e, at);
+        }
+        if (ok && watch) ok = watch(t, number, k, ctx);
+        neural_progress(v, (at + 1.0) / t->steps, "test step %d of %d", at + 1, t->steps);
+    }
+    neural_script_free(&s);
+    return ok;
+}
+
+static int neural_trial_run(neural_trial *t, neural_watch *watch, void *ctx) {
+    neural_start start;
+    int ok = 1;
+    start.data = save_world(t->v->r->w, &start.size);
+    for (int pass = 0; ok && pass < t->v->r->o.repeat; pass++)
+        for (int q = 0; ok && q < t->v->d->script.test; q++)
+            ok = neural_trial_sequence(t, q, &start, pass == 0 ? watch : NULL, ctx);
+    free(start.data);
+    return ok;
+}
+
+static double neural_mean(const double *v, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s += v[i] / n;
+    return s;
+}
+static double neural_mean_of(const int *v, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s += (double)v[i] / n;
+    return s;
+}
+static double neural_most(const double *v, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s = fmax(s, v[i]);
+    return s;
+}
+static int neural_exits(const neural_entry *e, int n, tss_exit x) {
+    int s = 0;
+    for (int i = 0; i < n; i++) s += e->exit[i] == (int)x;
+    return s;
+}
+
+static void neural_table(const neural_trial *t) {
+    printf("%-10s %9s %7s %7s %24s %10s %10s %10s %10s %10s %9s\n", "method", "ms/step", "iter.", "eval.",
+           "converged/saddle/line/it", "gradient", "energy", "error", "farthest", "projection", "Lip");
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        const neural_entry *e = &t->e[k];
+        char exits[60];
+        int n = t->steps;
+        if (!e->used) continue;
+        snprintf(exits, sizeof exits, "%d/%d/%d/%d", neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE),
+                 neural_exits(e, n, TSS_EXIT_LINE_SEARCH), neural_exits(e, n, TSS_EXIT_ITERATIONS));
+        printf("%-10s %9.3f %7.1f %7.1f %24s %10.3g %10.5g %10.3g %10.3g %10.3g %9.4g\n", neural_trial_names[k],
+               1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n), exits,
+               neural_mean(e->gradient, n), neural_mean(e->energy, n), neural_mean(e->mean, n), neural_most(e->farthest, n),
+               e->projection_mean, e->lip);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_evaluate
+// ---------------------------------------------------------------------------------------------
+
+// Every fourth state of the tests.
+static int neural_project(neural_trial *t, neural_entry *e) {
+    neural *v = t->v;
+    int count = 0;
+    (void)tss_reduced_set_handles(e->s, 0, NULL, NULL);
+    for (int f = 0; f < v->tests; f += 4, count++) {
+        double mean, most;
+        const double *x = v->test + (size_t)f * (size_t)v->n;
+        double *z = e->m.encoder ? neural_z(v, &e->m, x, 1) : NULL;
+        if (z) (void)tss_reduced_set(e->s, z);
+        free(z);
+        if (tss_reduced_project(e->s, x, NULL) != TSS_OK) return fail(v->r, "%s: test state %d cannot be projected", v->r->o.scene, f);
+        neural_distance(t, tss_reduced_x(e->s), x, &mean, &most);
+        e->projection_mean += mean, e->projection_farthest = fmax(e->projection_farthest, most);
+    }
+    e->projection_mean /= count;
+    return 1;
+}
+
+// Eq. 7 with all cells, in the unit of z and of the spread of z.
+static int neural_lip(neural_trial *t, neural_entry *e) {
+    neural *v = t->v;
+    int count = v->d->samples;
+    double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
+    if (!v->d->unsupervised && count > v->tests) count = v->tests;
+    double *z = neural_z(v, &e->m, x, count);
+    tss_result r = tss_lipschitz_estimate(e->m.decoder, v->elements, v->work, 2, count, z, &e->lip);
+    double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
+    e->z_scale = neural_z_scale(z, count, v->d->r, mean);
+    free(x), free(z), free(mean);
+    return r == TSS_OK ? 1 : fail(v->r, "%s: Eq. 7: %s", v->r->o.scene, tss_result_text(r));
+}
+
+static void neural_machine(char text[160]) {
+    char line[200];
+    FILE *f = fopen("/proc/cpuinfo", "r");
+    snprintf(text, 160, "unknown processor");
+    while (f && fgets(line, sizeof line, f))
+        if (strncmp(line, "model name", 10) == 0 && strchr(line, ':')) {
+            line[strcspn(line, "\n")] = 0;
+            snprintf(text, 160, "%.150s", strchr(line, ':') + 2);
+            break;
+        }
+    if (f) fclose(f);
+}
+
+static int neural_rows(neural_trial *t) {
+    neural *v = t->v;
+    char path[700], name[120], machine[160];
+    snprintf(path, sizeof path, "%s/evaluate.csv", v->r->o.out);
+    int old = access(path, F_OK) == 0, n = t->steps;
+    FILE *f = fopen(path, "a");
+    if (!f) return fail(v->r, "%s: cannot be written: %s", path, strerror(errno));
+    neural_machine(machine);
+    fprintf(f, "# %s, threads %d, test steps %d, best of %d", machine, v->r->o.threads, n, v->r->o.repeat);
+    for (int k = 0; k < v->r->o.sets; k++) fprintf(f, "%s %s", k ? "" : ", with", v->r->o.set[k]);
+    fputc('\n', f);
+    if (!old)
+        fputs("system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,"
+              "exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,projection_max,simulation_max,"
+              "energy,z_scale,lip_relative,lipschitz_weight,solver\n", f);
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        const neural_entry *e = &t->e[k];
+        if (!e->used) continue;
+        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s\n",
+                sweep_name(v->r, name), neural_trial_names[k], v->r->o.seed, v->n, v->cells, k == NEURAL_TRIAL_FULL ? v->n : v->d->r,
+                1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n),
+                neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE), neural_exits(e, n, TSS_EXIT_LINE_SEARCH),
+                neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip, e->projection_mean,
+                neural_mean(e->mean, n), e->train_seconds, e->projection_farthest, neural_most(e->farthest, n),
+                neural_mean(e->energy, n), e->z_scale, e->lip * pow(e->z_scale, 3), k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
+                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind]);
+    }
+    return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
+}
+
+static int neural_evaluate(neural *v) {
+    neural_trial t;
+    int ok = neural_trial_open(v, &t) && neural_trial_run(&t, NULL, NULL);
+    for (int k = 0; ok && k < NEURAL_TRIAL_FULL; k++)
+        if (t.e[k].used) ok = neural_project(&t, &t.e[k]) && (k == NEURAL_TRIAL_LINEAR || neural_lip(&t, &t.e[k]));
+    if (ok) neural_table(&t);
+    if (ok) {
+        const neural_entry *a = &t.e[NEURAL_TRIAL_VANILLA], *b = &t.e[NEURAL_TRIAL_LIPSCHITZ];
+        printf("speedup %.3f lip %.3f (relative to the spread of z %.3f) projection %.3f simulation %.3f (vanilla over lipschitz, the last two the other way)\n",
+               neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps), a->lip / b->lip,
+               a->lip * pow(a->z_scale, 3) / (b->lip * pow(b->z_scale, 3)),
+               b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
+        ok = neural_rows(&t);
+    }
+    neural_trial_close(&t);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_run: what it looks like
+// ---------------------------------------------------------------------------------------------
+
+#define NEURAL_SHOTS 4  // pictures a method
+
+typedef struct neural_album {
+    view_image shot[NEURAL_SHOTS * NEURAL_TRIAL_FULL];
+    const char *label[NEURAL_SHOTS * NEURAL_TRIAL_FULL];
+    int shots;
+    FILE *rows;
+} neural_album;
+
+static void neural_draw_state(run *r, const double *x, const float color[3]) {
+    int dim = r->s.world.dim;
+    for (int i = 0; i < tss_world_nodes(r->w); i++)
+        for (int c = 0; c < 3; c++) r->x3[3 * i + c] = c < dim ? x[dim * i + c] : 0;
+    memcpy(r->s.body[0].color, color, 3 * sizeof *color);
+    draw_body(r, 0);
+}
+
+// The subspace's state in blue over full space in purple.
+static int neural_shoot(neural_trial *t, neural_album *a) {
+    static const float blue[3] = {0.25f, 0.55f, 0.85f}, purple[3] = {0.62f, 0.40f, 0.72f};
+    run *r = t->v->r;
+    for (int q = 0; q < NEURAL_TRIAL_FULL; q++) {
+        view_look look = scene_look(r);
+        if (!t->e[q].used) continue;
+        view_begin(r->view, &r->camera, &look);
+        neural_draw_state(r, tss_world_positions(r->w), purple);
+        neural_draw_state(r, tss_reduced_x(t->e[q].s), blue);
+        view_image im = view_render(r->view);
+        if (!im.rgb) return fail(r, "out of memory for a picture");
+        a->label[a->shots] = neural_trial_names[q];
+        a->shot[a->shots++] = view_image_shrink(&im, im.width);
+    }
+    return 1;
+}
+
+static int neural_watch_step(neural_trial *t, int sequence, int k, void *ctx) {
+    neural_album *a = (neural_album *)ctx;
+    int stride = t->v->d->script.stride, tests = t->steps;
+    int at = sequence * (t->v->d->script.length / stride) + k / stride;
+    for (int q = 0; q < NEURAL_TRIALS; q++) {
+        const neural_entry *e = &t->e[q];
+        if (e->used)
+            fprintf(a->rows, "%d,%d,%s,%.6g,%d,%d,%d,%.6g,%.8g,%.6g,%.6g\n", sequence, k + 1, neural_trial_names[q], 1e3 * e->seconds[at],
+                    e->iterations[at], e->evaluations[at], e->exit[at], e->gradient[at], e->energy[at], e->mean[at], e->farthest[at]);
+    }
+    for (int s = 0; s < NEURAL_SHOTS; s++)
+        if (at == (int)((s + 0.5) * tests / NEURAL_SHOTS)) return neural_shoot(t, a);
+    return 1;
+}
+
+static double *neural_as_double(const int *v, int n) {
+    double *out = (double *)need((size_t)n, sizeof *out);
+    for (int i = 0; i < n; i++) out[i] = v[i];
+    return out;
+}
+
+static void neural_plots(report *p, neural_trial *t) {
+    report_series s[NEURAL_TRIALS], it[NEURAL_TRIALS], er[NEURAL_TRIALS];
+    int n = 0, subspaces = 0;
+    memset(s, 0, sizeof s), memset(it, 0, sizeof it), memset(er, 0, sizeof er);
+    for (int q = 0; q < NEURAL_TRIALS; q++) {
+        neural_entry *e = &t->e[q];
+        if (!e->used) continue;
+        s[n].name = it[n].name = er[n].name = neural_trial_names[q], s[n].count = it[n].count = er[n].count = t->steps;
+        s[n].y = e->seconds, it[n].y = neural_as_double(e->iterations, t->steps), er[n].y = e->mean;
+        n++, subspaces += q != NEURAL_TRIAL_FULL;
+    }
+    report_plot a = report_plot_default("Time of a step", "test step", "s");
+    a.log_y = 1;
+    report_add_plot(p, &a, s, n);
+    a = report_plot_default("Iterations of a step", "test step", "iterations"), a.log_y = 1;
+    report_add_plot(p, &a, it, n);
+    a = report_plot_default("Distance from full space, mean of the nodes", "test step", "over the diagonal"), a.log_y = 1;
+    report_add_plot(p, &a, er, subspaces);
+    for (int k = 0; k < n; k++) free((void *)it[k].y);
+}
+
+static int neural_page(neural_trial *t, neural_album *a) {
+    run *r = t->v->r;
+    char path[700], name[120], text[80];
+    const char *paths[1] = {path};
+    int used = t->e[NEURAL_TRIAL_LINEAR].used ? 3 : 2;
+    view_error why;
+    report_error bad;
+    view_image sheet = view_image_sheet(a->shot, a->shots, used, 6, a->label);
+    snprintf(path, sizeof path, "%s/states_%d.png", r->o.out, r->o.seed);
+    int ok = sheet.rgb && view_write_png(path, &sheet, &why);
+    view_image_free(&sheet);
+    if (!ok) return fail(r, "%s", sheet.rgb ? why.message : "out of memory for a picture");
+    report *p = report_begin(sweep_name(r, name), "neural subspaces against full space (purple)");
+    snprintf(text, sizeof text, "%.2f times vanilla's speed", neural_mean(t->e[0].seconds, t->steps) / neural_mean(t->e[1].seconds, t->steps));
+    report_status(p, "lipschitz", text, REPORT_INFO);
+    report_pictures(p, paths, NULL, 1);
+    neural_plots(p, t);
+    return report_end(p, r->o.out, &bad) ? 1 : fail(r, "%s", bad.message);
+}
+
+static int neural_run(neural *v) {
+    neural_trial t;
+    neural_album a;
+    char path[700];
+    run *r = v->r;
+    memset(&a, 0, sizeof a);
+    r->png = 1, r->vtu = r->obj = 0, r->s.frames.field = SCENE_FIELD_NONE;
+    int ok = neural_trial_open(v, &t) && open_frames(r);
+    snprintf(path, sizeof path, "%s/steps_%d.csv", r->o.out, r->o.seed);
+    a.rows = ok ? fopen(path, "w") : NULL;
+    if (ok && !a.rows) ok = fail(r, "%s: cannot be written: %s", path, strerror(errno));
+    if (ok) fputs("sequence,step,method,ms,iterations,evaluations,exit,gradient,energy,error_mean,error_farthest\n", a.rows);
+    ok = ok && neural_trial_run(&t, neural_watch_step, &a);
+    if (a.rows) fclose(a.rows);
+    if (ok) neural_table(&t);
+    ok = ok && neural_page(&t, &a);
+    for (int k = 0; k < a.shots; k++) view_image_free(&a.shot[k]);
+    neural_trial_close(&t);
+    return ok;
+}
+
+static int command_neural(run *r) {
+    static neural v;
+    int ok = neural_open(r, &v);
+    if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v) : neural_evaluate(&v);
+    neural_close(&v);
+    return !ok ? 2 : v.stopped ? 3 : 0;
+}

@@ -1,0 +1,47 @@
+#!/bin/sh
+# `tss neural` on a bar of 80 tets: a line `ok` or `FAILED` a claim. tests/neural.sh BUILD
+build=$1; out=$build/neural_out; scene=examples/scenes/neural_twist_bar_small.json
+rm -rf "$out"
+claim() { if eval "$2"; then echo "ok $1"; else echo "FAILED $1"; fi; }
+tiny="--set bodies.0.shape.cells=[4,2,2] --set neural.r=4 --set neural.hidden=[16] --set neural.script.length=20
+    --set neural.script.hold=[5,10] --set neural.script.train=6 --set neural.script.test=1 --set neural.script.stride=1 --set neural.train.steps=400
+    --set neural.lipschitz.steps=200 --set neural.lipschitz.cubature=20 --set neural.samples=8 --set frames.size=[160,96]"
+# shellcheck disable=SC2086
+tss() { action=$1; to=$2; shift 2; "$build/tss" neural "$action" $scene $tiny -o "$to" "$@"; }
+# value METHOD COLUMN of evaluate.csv, by the column's name
+value() { awk -F, -v m="$1" -v c="$2" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == m {print $k}' "$out/a/evaluate.csv"; }
+less() { awk -v a="$1" -v b="$2" 'BEGIN {exit !(a + 0 == a && b + 0 == b && a < b)}'; }
+
+claim "neural: trains" 'tss train "$out/a" >"$build/neural.log" 2>&1'
+claim "neural: evaluates" 'tss evaluate "$out/a" >>"$build/neural.log" 2>&1'
+claim "neural: runs" 'tss run "$out/a" >>"$build/neural.log" 2>&1'
+claim "neural: the header is the documented one" \
+    'grep -q "^system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds" "$out/a/evaluate.csv"'
+claim "neural: the machine is named" 'head -1 "$out/a/evaluate.csv" | grep -q "^# .*, threads "'
+claim "neural: a row a method" '[ "$(grep -c "^neural_twist_bar_small," "$out/a/evaluate.csv")" = 4 ]'
+claim "neural: L_LS lowers Eq. 7" 'less "$(value lipschitz lip)" "$(value vanilla lip)"'
+claim "neural: full space is its own reference" '[ "$(value full simulation_error)" = 0 ]'
+claim "neural: a row a step and method" '[ "$(grep -c "^0," "$out/a/steps_0.csv")" = 80 ]'
+claim "neural: pictures and a page" '[ -s "$out/a/states_0.png" ] && [ -s "$out/a/report.html" ]'
+# Stopped again and again it ends in the same bits.
+claim "neural: stops when its time is up" 'tss train "$out/b" --minutes 0.002 >/dev/null 2>&1; [ $? = 3 ]'
+claim "neural: goes on where it stopped" \
+    'k=0; while ! tss train "$out/b" --minutes 0.01 >/dev/null 2>&1 && [ $k -lt 200 ]; do k=$((k + 1)); done; [ $k -lt 200 ]'
+for f in frames.bin base_0.tssn vanilla_0.tssn lipschitz_0.tssn; do
+    claim "neural: the same bits after stops: $f" 'cmp -s "$out/a/$f" "$out/b/$f"'
+done
+claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
+    --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
+    "$build/tss" neural evaluate examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
+    --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >>"$build/neural_c.log" 2>&1'
+# refused WORDS ARGUMENTS: exit 2 and these words
+refused() { words=$1; shift; tss "$@" >"$build/neural_bad.log" 2>&1; [ $? = 2 ] && grep -q -e "$words" "$build/neural_bad.log"; }
+claim "neural: refused: another action" 'refused "expected train, run or evaluate" walk "$out/a"'
+claim "neural: refused: a key" 'refused "neural.lipschitz.weigth: no such key; did you mean \"weight\"" train "$out/a" --set neural.lipschitz.weigth=1'
+claim "neural: refused: a value" 'refused "neural.r is 0, expected a whole number" train "$out/a" --set neural.r=0'
+claim "neural: refused: low above high" 'refused "low <= high" train "$out/a" --set "neural.script.handles.0.rotate=[[1,0,0],[0,0,0]]"'
+claim "neural: refused: contact" 'refused "contact.enabled is true, expected false" train "$out/a" --set contact.enabled=true'
+claim "neural: refused: an integrator" 'refused "expected \"quasistatic\" or \"euler\"" train "$out/a" --set world.integrator=bdf2'
+claim "neural: refused: frames of another script" 'refused "frames of another scene" train "$out/a" --set neural.script.seed=2'
+claim "neural: refused: another network" 'refused "a network of another scene" evaluate "$out/a" --set neural.hidden=[17]'
+claim "neural: refused: not trained" 'refused "tss neural train" evaluate "$out/a" --seed 7'
