@@ -923,6 +923,42 @@ static void test_skip_rule(void **state) {
     drop(&s);
 }
 
+// Where nodes have hardly moved H_x is that of an iterate before, elsewhere it is exact at x.
+static int lagged;
+static double lag_X, exact_X;
+
+static void look_at_lag(spy *y, tss_world *w, const tss_iterate *it) {
+    y->X = 0;
+    look_at_system(y, w, it);
+    if (y->s->drift > 0) lagged++, lag_X = fmax(lag_X, y->X);
+    else exact_X = fmax(exact_X, y->X);
+    assert_true(y->s->drift <= TSS__SUB_LAG * it->tol);
+}
+
+static void test_lag(void **state) {
+    static const plan p = {.dim = 3, .n = 4, .bodies = 2, .contact = 1, .speed = 1.5, .E = 1e5, .h = 0.005, .count = 4,
+                           .lower = TSS_BASIS_SKINNING, .upper = TSS_BASIS_AFFINE, .kappa = 3e8, .tol = 2e-3, .steps = 8};
+    tss_subspace_def d = tss_subspace_def_default();
+    const tss_secant kinds[] = {TSS_SECANT_FROZEN, TSS_SECANT_BFGS, TSS_SECANT_EXACT};
+    (void)state;
+    d.error_nodes = 0.2, d.partitions = 12;
+    for (int k = 0; k < 3; k++) {
+        spy y;
+        scene s;
+        memset(&y, 0, sizeof y);
+        lagged = 0, lag_X = exact_X = 0, d.secant = kinds[k];
+        make(&s, &p, &d);
+        watch(&s, &p);
+        y.look = look_at_lag;
+        spy_on(&y, &s);
+        for (int i = 0; i < p.steps; i++) step(&s);
+        print_message("    %d of %d iterates lag, H_x within %.1e; elsewhere %.1e\n", lagged, y.looks, lag_X, exact_X);
+        assert_true(y.some > 0 && exact_X < 1e-12);
+        assert_true(kinds[k] == TSS_SECANT_EXACT ? lagged == 0 : lagged > 0 && lag_X > 0 && lag_X < 0.1);
+        drop(&s);
+    }
+}
+
 // ---- against the full space -------------------------------------------------------------------
 
 // Thresholds at 0 against the world's own Newton method, step by step from the same state; the yard
@@ -1129,7 +1165,7 @@ static tss_subspace_def busy_def(void) {
     return d;
 }
 
-static trail run_busy(const tss_host *host, int steps) {
+static trail run_busy_ready(const tss_host *host, int steps, int ready) {
     plan p = busy_plan;
     tss_subspace_def d = busy_def();
     tss_host h = *host;
@@ -1139,6 +1175,7 @@ static trail run_busy(const tss_host *host, int steps) {
     memset(&t, 0, sizeof t);
     p.host = &h;
     make(&s, &p, &d);
+    for (int k = 0; k < ready; k++) ok(s.w, tss_world_ready(s.w));
     for (int k = 0; k < steps; k++) {
         tss_step_info info = step(&s);
         follow(&t, &info, &nodes, &modes);
@@ -1146,6 +1183,27 @@ static trail run_busy(const tss_host *host, int steps) {
     t.hash = tss_world_hash(s.w);
     drop(&s);
     return t;
+}
+
+static trail run_busy(const tss_host *host, int steps) { return run_busy_ready(host, steps, 0); }
+
+// tss_world_ready, once or twice, changes no bit and no decision; what it makes is not made again.
+static void test_ready(void **state) {
+    tss_host host = tss_host_default();
+    trail one = run_busy(&host, busy_plan.steps);
+    (void)state;
+    for (int k = 1; k < 3; k++) {
+        trail t = run_busy_ready(&host, busy_plan.steps, k);
+        assert_true(memcmp(&one, &t, sizeof t) == 0);
+    }
+    plan p = busy_plan;
+    tss_subspace_def d = busy_def();
+    scene s;
+    make(&s, &p, &d);
+    assert_false(tss_subspace_of(s.w)->built);
+    ok(s.w, tss_world_ready(s.w));
+    assert_true(tss_subspace_of(s.w)->built && tss_subspace_of(s.w)->modes > 0);
+    drop(&s);
 }
 
 // One to four threads of a pool, and OpenMP: the same bits.
@@ -2403,6 +2461,8 @@ int main(void) {
         cmocka_unit_test(test_skip_rule),
         cmocka_unit_test(test_full_limit),
         cmocka_unit_test(test_state_is_x),
+        cmocka_unit_test(test_lag),
+        cmocka_unit_test(test_ready),
         cmocka_unit_test(test_threads),
         cmocka_unit_test(test_units),
         cmocka_unit_test(test_resume),
