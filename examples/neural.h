@@ -741,6 +741,25 @@ static double neural_z_scale(const double *z, int count, int r, double *mean) {
     return sqrt(s);
 }
 
+// Frames of a batch and where their handles are. lipschitz.window W > 0: groups of NEURAL_GROUP frames,
+// those of a group within W of its first and with its handles: all states of the one E of a step.
+#define NEURAL_GROUP 4
+static void neural_draw_lipschitz(neural_trainer *t) {
+    neural *v = t->v;
+    int batch = v->d->lipschitz.batch, W = v->d->lipschitz.window, length = v->d->script.length;
+    neural_draw(v, &t->m.rng, batch, t->c2, t->drawn);
+    for (int i = 0; i < batch; i++) {
+        int lead = W > 0 ? t->drawn[i - i % NEURAL_GROUP] : t->drawn[i];
+        if (W > 0 && i % NEURAL_GROUP) {
+            int first = lead - lead % length, lo = lead - W > first ? lead - W : first;
+            int hi = lead + W < first + length ? lead + W : first + length - 1;
+            t->drawn[i] = lo + (int)((hi - lo + 1) * tss_rng_uniform(&t->m.rng));
+            memcpy(t->c2 + (size_t)i * (size_t)v->p, v->code + (size_t)t->drawn[i] * (size_t)v->p, (size_t)v->p * sizeof *t->c2);
+        }
+        neural_pinned(v, v->train + (size_t)v->n * (size_t)lead, 1, t->pin + i * v->pinned);
+    }
+}
+
 // L_LS of a batch of frames of their own; its gradient is added to g. lipschitz.relative: L_LS is
 // multiplied by s^(2(o + 1)), s the spread of the batch's z: else it falls when z is but stretched.
 static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double *loss) {
@@ -748,21 +767,22 @@ static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double
     const scene_neural *d = v->d;
     size_t dec = neural_parameters(t->decoder);
     tss_lipschitz_def ld = neural_lipschitz(v);
-    int batch = d->lipschitz.batch, r = d->r;
-    tss_held held = {v->pinned, v->pin, t->pin};
-    ld.held = v->pinned ? &held : NULL;
-    neural_draw(v, &t->m.rng, batch, t->c2, t->drawn);
-    for (int i = 0; i < batch; i++) neural_pinned(v, v->train + (size_t)v->n * (size_t)t->drawn[i], 1, t->pin + i * v->pinned);
+    int batch = d->lipschitz.batch, r = d->r, each = d->lipschitz.window ? NEURAL_GROUP : batch, groups = batch / each;
+    neural_draw_lipschitz(t);
     for (int i = 0; i < 2 * r * ld.probes && ld.estimator != TSS_LIPSCHITZ_EXACT; i++) t->probe[i] = tss_rng_normal(&t->m.rng);
     memset(t->z_bar, 0, (size_t)batch * (size_t)r * sizeof *t->z_bar);
     tss_result e = tss_net_forward(t->encoder, v->work, batch, t->c2, t->z);
     double spread = d->lipschitz.relative ? neural_z_scale(t->z, batch, r, t->z_mean) : 1;
-    double power = 2 * (ld.order + 1), unit = pow(spread, power);
-    weight *= unit;
-    if (e == TSS_OK)
-        e = tss_loss_lipschitz(t->m.decoder, v->cubature ? v->cubature : v->elements, v->work, &ld, batch, t->z,
-                               ld.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe, weight, loss, t->g,
-                               d->lipschitz.through_encoder ? t->z_bar : NULL);
+    double power = 2 * (ld.order + 1), unit = pow(spread, power), part;
+    weight *= unit, *loss = 0;
+    for (int g = 0; g < groups && e == TSS_OK; g++) {
+        tss_held held = {v->pinned, v->pin, t->pin + g * each * v->pinned};
+        ld.held = v->pinned ? &held : NULL;
+        e = tss_loss_lipschitz(t->m.decoder, v->cubature ? v->cubature : v->elements, v->work, &ld, each, t->z + g * each * r,
+                               ld.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe, weight / groups, &part, t->g,
+                               d->lipschitz.through_encoder ? t->z_bar + g * each * r : NULL);
+        *loss += part / groups;
+    }
     for (int i = 0; d->lipschitz.relative && i < batch * r; i++)
         t->z_bar[i] += weight * *loss * power * (t->z[i] - t->z_mean[i % r]) / (batch * r * spread * spread);
     *loss *= unit;

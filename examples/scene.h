@@ -255,7 +255,7 @@ typedef struct scene_neural {
         double rate, rate_end, lambda, sigma, eps;
     } train;
     struct {
-        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, cubature, samples;
+        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples;
         double rate, rate_end, weight;
     } lipschitz;
     struct {
@@ -1828,6 +1828,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.through_encoder, "through_encoder"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.relative, "relative"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.handles, "handles"),
+    SCENE__INT(scene_neural, lipschitz.window, "window", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
     SCENE__END};
