@@ -122,8 +122,9 @@
                            warmup (0), order (2), estimator: exact | uv | u (u), probes (1), undivided
                            (false), through_encoder (true), relative: L_LS in units
                            of the spread of z, supervised (false), handles: L_LS and Eq. 7 of P with
-                           handles where the frames have them, supervised (true), cubature: cells, 0:
-                           all (0), samples: that choose them (64)}
+                           handles where the frames have them, supervised (true), window: L_LS of
+                           groups of frames this near under one's handles (0: off), cubature: cells,
+                           0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
                            (10), max_line (128), max_iterations (1024)}
     .samples               of Eq. 7 (256)
