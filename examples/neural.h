@@ -187,6 +187,9 @@ static int neural_open(run *r, neural *v) {
     if (v->d->lipschitz.probes > v->d->r)
         return fail(r, "%s: neural.lipschitz.probes is %d, expected at most neural.r (%d)", r->o.scene,
                     v->d->lipschitz.probes, v->d->r);
+    if (v->d->lipschitz.window && v->d->lipschitz.batch % 4)
+        return fail(v->r, "%s: neural.lipschitz.batch is %d, expected a multiple of 4 with window", v->r->o.scene,
+                    v->d->lipschitz.batch);
     return 1;
 }
 
