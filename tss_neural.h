@@ -250,8 +250,9 @@ typedef enum tss_estimator {
     TSS_LIPSCHITZ_U,   // order 2: ‖ΔH u‖², u ~ N(0, 1): the same mean, far less variance
 } tss_estimator;
 
-// Coordinates that a script moves (tss_reduced_set_handles): in P they are where the script says, not
-// where the decoder does. They do not depend on z, and no adjoint of theirs reaches the decoder.
+// Coordinates that a script moves (tss_reduced_set_handles): in P they are where the script says,
+// not where the decoder does. They do not depend on z, and no adjoint of theirs reaches the
+// decoder.
 typedef struct tss_held {
     int count;            // 0: none
     const int *index;     // coordinates, each once
@@ -391,13 +392,13 @@ typedef struct tss_training_def {
     double eps;            // of the logarithm; default 1e-8
     uint64_t ramp;  // unsupervised: steps over which out_scale grows from 0 to 1, and sigma from 0
                     // to itself; default 0: none
-    double lipschitz_weight;  // λ_LS; default 0: vanilla
-    uint64_t lipschitz_from;  // first step with L_LS; default 0
-    int lipschitz_batch;      // samples of L_LS, >= 2; default 16
-    tss_lipschitz_def lipschitz;  // its held is not used: supervised, the coordinates below are where
-                                  // the frame has them in L_LS
-    int held_count;               // default 0
-    const int *held;              // coordinates, each once; borrowed
+    double lipschitz_weight;      // λ_LS; default 0: vanilla
+    uint64_t lipschitz_from;      // first step with L_LS; default 0
+    int lipschitz_batch;          // samples of L_LS, >= 2; default 16
+    tss_lipschitz_def lipschitz;  // its held is not used: supervised, the coordinates below are
+                                  // where the frame has them in L_LS
+    int held_count;       // default 0
+    const int *held;      // coordinates, each once; borrowed
     int through_encoder;  // supervised: L_LS also moves the encoder through z = g(x); default 1
     tss_adam_def adam;
     int cookie;
@@ -2288,8 +2289,10 @@ static int tss__reduced_column(const tss_elements *e, int coordinate) {
     int lo = 0, hi = e->used * e->dim;
     while (lo < hi) {
         int mid = (lo + hi) / 2;
-        if (e->dof[mid] < coordinate) lo = mid + 1;
-        else hi = mid;
+        if (e->dof[mid] < coordinate)
+            lo = mid + 1;
+        else
+            hi = mid;
     }
     return lo < e->used * e->dim && e->dof[lo] == coordinate ? lo : -1;
 }
@@ -3549,7 +3552,7 @@ struct tss_training {
     double *p;        // one block
     size_t bytes;
     double *g, *x, *z, *z_bar, *probe;  // gradients; a batch of frames; of z
-    double *held;  // of a batch's frames
+    double *held;                       // of a batch's frames
 };
 
 tss_training_def tss_training_def_default(void) {
@@ -3684,16 +3687,17 @@ static tss_result tss__training_lipschitz(tss_training *t, tss_training_info *in
         tss__training_frames(t, B);
         result = tss_net_forward(m->encoder, t->work, B, t->x, t->z);
         for (int i = 0, n = d->held_count; i < B * n; i++)
-            t->held[i] = t->x[(size_t)(i / n) * (size_t)m->decoder->outputs + (size_t)d->held[i % n]];
+            t->held[i] =
+                t->x[(size_t)(i / n) * (size_t)m->decoder->outputs + (size_t)d->held[i % n]];
     } else {
         tss__training_normals(t, t->z, B);
     }
     if (probe) tss__training_normals(t, probe, 2 * d->lipschitz.probes);
     if (z_bar) tss__n_zero(z_bar, (size_t)(B * r));
     if (result == TSS_OK)
-        result = tss_loss_lipschitz(m->decoder, d->cubature ? d->cubature : d->elements, t->work,
-                                    &ld, B, t->z, probe, d->lipschitz_weight,
-                                    &info->lipschitz, t->g, z_bar);
+        result =
+            tss_loss_lipschitz(m->decoder, d->cubature ? d->cubature : d->elements, t->work, &ld, B,
+                               t->z, probe, d->lipschitz_weight, &info->lipschitz, t->g, z_bar);
     if (result == TSS_OK && z_bar)
         result = tss_net_backward(m->encoder, t->work, B, t->x, z_bar, t->g + t->dec, NULL);
     return result;

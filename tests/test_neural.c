@@ -784,7 +784,8 @@ static void check_losses(int dim, tss_activation a, int matrix) {
             c.lip.held = &held, c.lip.undivided = 0;
             memset(gz, 0, B * R * sizeof *gz), memset(gd, 0, nd * sizeof *gd);
             loss_run(&c, weight, gd, NULL, gz);
-            snprintf(name, sizeof name, "loss %d, held, activation %d, %dD, matrix %d", kind, (int)a, dim, matrix);
+            snprintf(name, sizeof name, "loss %d, held, activation %d, %dD, matrix %d", kind,
+                     (int)a, dim, matrix);
             check_loss(&c, name, tss_net_parameters(dec), gd, nd, weight);
             check_loss(&c, name, z, gz, B * R, weight);
             free(value);
@@ -802,8 +803,9 @@ static void test_losses(void **state) {
             for (int matrix = 0; matrix < 2; matrix++) check_losses(dim, (tss_activation)a, matrix);
 }
 
-// Held coordinates: the same as a decoder whose rows there are 0 and whose base is the value; with a
-// value for each sample, φ is what each sample has alone. All cells and a subset; the cubature too.
+// Held coordinates: the same as a decoder whose rows there are 0 and whose base is the value; with
+// a value for each sample, φ is what each sample has alone. All cells and a subset; the cubature
+// too.
 static void test_held(void **state) {
     (void)state;
     enum { R = 3, B = 4, P = 5, HELD = 4 };
@@ -818,8 +820,9 @@ static void test_held(void **state) {
             assert_int_equal(tss_elements_create(NULL, &d, &s.e), TSS_OK);
         }
         size_t n = (size_t)s.coords;
-        double *basis = randoms(n * P, 0.4), *pinned = doubles(n * P), *base = doubles(n), *value = doubles(B * HELD),
-               *z = randoms(B * R, 1), *probe = randoms(2 * R, 1), loss[2], lip[2], error[2];
+        double *basis = randoms(n * P, 0.4), *pinned = doubles(n * P), *base = doubles(n),
+               *value = doubles(B * HELD), *z = randoms(B * R, 1), *probe = randoms(2 * R, 1),
+               loss[2], lip[2], error[2];
         int index[HELD] = {7, 1, s.coords - 2, 12}, width[3] = {R, 6, P}, subset[2][4], count[2];
         tss_net *net[2];
         for (int k = 0; k < B * HELD; k++) value[k] = s.X[index[k % HELD]] + 0.1 * (k % HELD);
@@ -836,38 +839,49 @@ static void test_held(void **state) {
         }
         tss_held held = {HELD, index, value};
         for (int o = 0; o < 4; o++) {
-            double *g[2] = {doubles(count_of(net[0])), doubles(count_of(net[0]))}, *gz[2] = {doubles(B * R), doubles(B * R)};
+            double *g[2] = {doubles(count_of(net[0])), doubles(count_of(net[0]))},
+                   *gz[2] = {doubles(B * R), doubles(B * R)};
             tss_lipschitz_def d = tss_lipschitz_def_default();
             d.order = o < 3 ? o : 2, d.estimator = o < 3 ? TSS_LIPSCHITZ_EXACT : TSS_LIPSCHITZ_U;
             for (int k = 0; k < 2; k++) {
                 d.held = k ? NULL : &held;
-                assert_int_equal(tss_loss_lipschitz(net[k], s.e, s.work, &d, B, z, o < 3 ? NULL : probe, 1, &loss[k], g[k], gz[k]), TSS_OK);
+                assert_int_equal(tss_loss_lipschitz(net[k], s.e, s.work, &d, B, z,
+                                                    o < 3 ? NULL : probe, 1, &loss[k], g[k], gz[k]),
+                                 TSS_OK);
                 tss_lipschitz_estimate_held(net[k], s.e, s.work, d.order, d.held, B, z, &lip[k]);
             }
             assert_true(fabs(loss[0] / loss[1] - 1) < 1e-11 && fabs(lip[0] / lip[1] - 1) < 1e-11);
-            for (size_t i = 0; i < count_of(net[0]); i++) assert_true(fabs(g[0][i] - g[1][i]) <= 1e-9 * (fabs(g[1][i]) + loss[1]));
-            for (int i = 0; i < B * R; i++) assert_true(fabs(gz[0][i] - gz[1][i]) <= 1e-9 * (fabs(gz[1][i]) + loss[1]));
+            for (size_t i = 0; i < count_of(net[0]); i++)
+                assert_true(fabs(g[0][i] - g[1][i]) <= 1e-9 * (fabs(g[1][i]) + loss[1]));
+            for (int i = 0; i < B * R; i++)
+                assert_true(fabs(gz[0][i] - gz[1][i]) <= 1e-9 * (fabs(gz[1][i]) + loss[1]));
             free(g[0]), free(g[1]), free(gz[0]), free(gz[1]);
         }
         for (int k = 0; k < 2; k++) {
             tss_cubature_def c = tss_cubature_def_default();
             double weight[4];
             c.count = 4, c.held = k ? NULL : &held;
-            assert_int_equal(tss_cubature_select(net[k], s.e, s.work, &c, B, z, subset[k], weight, &count[k], &error[k]), TSS_OK);
+            assert_int_equal(tss_cubature_select(net[k], s.e, s.work, &c, B, z, subset[k], weight,
+                                                 &count[k], &error[k]),
+                             TSS_OK);
         }
-        assert_true(count[0] == count[1] && memcmp(subset[0], subset[1], (size_t)count[0] * sizeof(int)) == 0);
+        assert_true(count[0] == count[1] &&
+                    memcmp(subset[0], subset[1], (size_t)count[0] * sizeof(int)) == 0);
         assert_true(fabs(error[0] - error[1]) < 1e-9);
         index[0] = s.coords;  // out of range
-        assert_int_equal(tss_lipschitz_estimate_held(net[0], s.e, s.work, 2, &held, B, z, lip), TSS_ERROR_BAD_ARGUMENT);
+        assert_int_equal(tss_lipschitz_estimate_held(net[0], s.e, s.work, 2, &held, B, z, lip),
+                         TSS_ERROR_BAD_ARGUMENT);
         index[0] = 7, held.value = NULL;
-        assert_int_equal(tss_lipschitz_estimate_held(net[0], s.e, s.work, 2, &held, B, z, lip), TSS_ERROR_BAD_ARGUMENT);
+        assert_int_equal(tss_lipschitz_estimate_held(net[0], s.e, s.work, 2, &held, B, z, lip),
+                         TSS_ERROR_BAD_ARGUMENT);
         tss_net_destroy(net[0]), tss_net_destroy(net[1]), scene_free(&s);
         free(basis), free(pinned), free(base), free(value), free(z), free(probe);
     }
 }
 
-// One step of Adam with an eps so large that it goes down the gradient: Eq. (10) of the frames drawn,
-// held coordinates where each frame has them, against differences in all parameters of both networks.
+// One step of Adam with an eps so large that it goes down the gradient: Eq. (10) of the frames
+// drawn, held coordinates where each frame has them, against differences in all parameters of both
+// networks.
 typedef struct held_step {
     scene *s;
     tss_model m;
@@ -882,16 +896,21 @@ static double held_step_loss(void *ctx, double t) {
     size_t n = (size_t)c->s->coords;
     double *x = doubles(9 * n), z[LIP * R], value[LIP * 2], loss[2];
     tss_net *net[2] = {c->m.decoder, c->m.encoder};
-    for (int k = 0; k < 2; k++) move(tss_net_parameters(net[k]), c->theta[k], c->dir[k], t, c->count[k]);
-    for (int i = 0; i < 9; i++) memcpy(x + (size_t)i * n, c->frames + (size_t)c->drawn[i] * n, n * sizeof *x);
+    for (int k = 0; k < 2; k++)
+        move(tss_net_parameters(net[k]), c->theta[k], c->dir[k], t, c->count[k]);
+    for (int i = 0; i < 9; i++)
+        memcpy(x + (size_t)i * n, c->frames + (size_t)c->drawn[i] * n, n * sizeof *x);
     tss_lipschitz_def d = tss_lipschitz_def_default();
     tss_held held = {2, c->held, value};
-    for (int i = 0; i < 2 * LIP; i++) value[i] = x[(size_t)(BATCH + i / 2) * n + (size_t)c->held[i % 2]];
+    for (int i = 0; i < 2 * LIP; i++)
+        value[i] = x[(size_t)(BATCH + i / 2) * n + (size_t)c->held[i % 2]];
     d.held = &held;
-    tss_loss_reconstruction(net[0], net[1], c->s->work, c->s->mass, BATCH, x, 1, &loss[0], NULL, NULL);
+    tss_loss_reconstruction(net[0], net[1], c->s->work, c->s->mass, BATCH, x, 1, &loss[0], NULL,
+                            NULL);
     tss_net_forward(net[1], c->s->work, LIP, x + BATCH * n, z);
     tss_loss_lipschitz(net[0], c->s->e, c->s->work, &d, LIP, z, NULL, 1, &loss[1], NULL, NULL);
-    for (int k = 0; k < 2; k++) memcpy(tss_net_parameters(net[k]), c->theta[k], c->count[k] * sizeof(double));
+    for (int k = 0; k < 2; k++)
+        memcpy(tss_net_parameters(net[k]), c->theta[k], c->count[k] * sizeof(double));
     free(x);
     return loss[0] + 0.3 * loss[1];
 }
@@ -903,12 +922,14 @@ static void test_held_training(void **state) {
     scene_make(&s, 2, 2, 1, 0);
     held_step c = {.s = &s, .held = {s.coords - 1, 2}};
     size_t n = (size_t)s.coords;
-    c.m.decoder = decoder_of(&s, R, TSS_SILU, 1, 3), c.m.encoder = encoder_of(&s, R, TSS_SILU), c.m.rng = tss_rng_seed(4);
+    c.m.decoder = decoder_of(&s, R, TSS_SILU, 1, 3), c.m.encoder = encoder_of(&s, R, TSS_SILU),
+    c.m.rng = tss_rng_seed(4);
     tss_net *net[2] = {c.m.decoder, c.m.encoder};
     c.frames = doubles(FRAMES * n);
     for (size_t i = 0; i < FRAMES * n; i++) c.frames[i] = s.X[i % n] + 0.2 * rnd();
     for (int k = 0; k < 2; k++) {
-        c.count[k] = count_of(net[k]), c.theta[k] = doubles(c.count[k]), c.dir[k] = randoms(c.count[k], 0.5);
+        c.count[k] = count_of(net[k]), c.theta[k] = doubles(c.count[k]),
+        c.dir[k] = randoms(c.count[k], 0.5);
         memcpy(c.theta[k], tss_net_parameters(net[k]), c.count[k] * sizeof(double));
     }
     tss_rng draws = c.m.rng;
@@ -922,7 +943,8 @@ static void test_held_training(void **state) {
     assert_int_equal(tss_training_step(t, NULL), TSS_OK);
     double slope = 0;
     for (int k = 0; k < 2; k++)
-        for (size_t i = 0; i < c.count[k]; i++) slope += (c.theta[k][i] - tss_net_parameters(net[k])[i]) * 1e3 * c.dir[k][i];
+        for (size_t i = 0; i < c.count[k]; i++)
+            slope += (c.theta[k][i] - tss_net_parameters(net[k])[i]) * 1e3 * c.dir[k][i];
     double size = held_step_loss(&c, 0);
     check_slope("training, held", held_step_loss, &c, slope, fabs(slope) + 0.1 * size, 1e-5);
     tss_training_destroy(t);
@@ -1879,10 +1901,9 @@ int main(void) {
         T(test_activations),  T(test_forward),        T(test_initial),       T(test_backward),
         T(test_net_jets),     T(test_potential),      T(test_subset),        T(test_element_jets),
         T(test_density),      T(test_reduced),        T(test_losses),        T(test_loss_values),
-        T(test_held),         T(test_held_training),
-        T(test_unbiased),     T(test_threads),        T(test_adam),          T(test_files),
-        T(test_paths),        T(test_resume),         T(test_refusals),      T(test_no_memory),
-        T(test_huge_gradient), T(test_cubature_tie),
+        T(test_held),         T(test_held_training),  T(test_unbiased),      T(test_threads),
+        T(test_adam),         T(test_files),          T(test_paths),         T(test_resume),
+        T(test_refusals),     T(test_no_memory),      T(test_huge_gradient), T(test_cubature_tie),
         T(test_cubature),     T(test_reduced_solver), T(test_reduced_exits), T(test_autoencoder),
         T(test_unsupervised),
     };
