@@ -250,12 +250,22 @@ typedef enum tss_estimator {
     TSS_LIPSCHITZ_U,   // order 2: ‖ΔH u‖², u ~ N(0, 1): the same mean, far less variance
 } tss_estimator;
 
+// Coordinates that a script moves (tss_reduced_set_handles): in P they are where the script says,
+// not where the decoder does. They do not depend on z, and no adjoint of theirs reaches the
+// decoder.
+typedef struct tss_held {
+    int count;            // 0: none
+    const int *index;     // coordinates, each once
+    const double *value;  // samples × count
+} tss_held;
+
 typedef struct tss_lipschitz_def {
     int order;                // o of Eq. (12): 0: P, 1: ∇P, 2 (default): ∇²P, Eq. (9)
     tss_estimator estimator;  // default EXACT; the others for order 2 only
     int probes;               // of the estimators, averaged, 1..r; default 1
     double floor;   // ‖Δz‖² is replaced by max(‖Δz‖², floor), >= 0; default 1e-12
     int undivided;  // 1: without the division by ‖Δz‖² (the spread of H alone); default 0
+    const tss_held *held;  // a value for each sample of the batch; borrowed; NULL (default): none
 } tss_lipschitz_def;
 TSS_API tss_lipschitz_def tss_lipschitz_def_default(void);
 
@@ -271,6 +281,10 @@ TSS_API tss_result tss_loss_lipschitz(const tss_net *decoder, const tss_elements
 TSS_API tss_result tss_lipschitz_estimate(const tss_net *decoder, const tss_elements *e,
                                           tss_work *work, int order, int batch, const double *z,
                                           double *out);
+// The same with coordinates that a script moves (NULL: none).
+TSS_API tss_result tss_lipschitz_estimate_held(const tss_net *decoder, const tss_elements *e,
+                                               tss_work *work, int order, const tss_held *held,
+                                               int batch, const double *z, double *out);
 
 // ---------------------------------------------------------------------------------------------
 // >>cubature (public)
@@ -286,6 +300,7 @@ typedef struct tss_cubature_def {
                      // samples × r doubles
     double tol;      // relative error at which to stop, >= 0; default 0
     uint64_t seed;
+    const tss_held *held;  // a value for each sample; borrowed; NULL (default): none
 } tss_cubature_def;
 TSS_API tss_cubature_def tss_cubature_def_default(void);
 // z: samples × r, of the initial subspace; each counts alike (its equations are divided by the norm
@@ -377,10 +392,13 @@ typedef struct tss_training_def {
     double eps;            // of the logarithm; default 1e-8
     uint64_t ramp;  // unsupervised: steps over which out_scale grows from 0 to 1, and sigma from 0
                     // to itself; default 0: none
-    double lipschitz_weight;  // λ_LS; default 0: vanilla
-    uint64_t lipschitz_from;  // first step with L_LS; default 0
-    int lipschitz_batch;      // samples of L_LS, >= 2; default 16
-    tss_lipschitz_def lipschitz;
+    double lipschitz_weight;      // λ_LS; default 0: vanilla
+    uint64_t lipschitz_from;      // first step with L_LS; default 0
+    int lipschitz_batch;          // samples of L_LS, >= 2; default 16
+    tss_lipschitz_def lipschitz;  // its held is not used: supervised, the coordinates below are
+                                  // where the frame has them in L_LS
+    int held_count;       // default 0
+    const int *held;      // coordinates, each once; borrowed
     int through_encoder;  // supervised: L_LS also moves the encoder through z = g(x); default 1
     tss_adam_def adam;
     int cookie;
@@ -2263,7 +2281,39 @@ typedef struct tss__n_reduced {
     double *gradient;  // batch × r: of the seeded sum in z (TANGENT: ∇P); overwritten; or NULL
     double *HD;        // TANGENT: batch × k × r, or NULL
     double *cell_scratch;
+    const tss_held *held;  // or NULL
 } tss__n_reduced;
+
+// The column of a coordinate where only those that elements touch are made; -1: not among them.
+static int tss__reduced_column(const tss_elements *e, int coordinate) {
+    int lo = 0, hi = e->used * e->dim;
+    while (lo < hi) {
+        int mid = (lo + hi) / 2;
+        if (e->dof[mid] < coordinate)
+            lo = mid + 1;
+        else
+            hi = mid;
+    }
+    return lo < e->used * e->dim && e->dof[lo] == coordinate ? lo : -1;
+}
+
+// Columns of a sample's rows that are held: value to the first row (NULL: 0), 0 to the others.
+static void tss__reduced_pin(const tss__n_reduced *j, double *rows, const double *value) {
+    const tss__jetpass *p = &j->p;
+    for (int h = 0; j->held && h < j->held->count; h++) {
+        int at = j->held->index[h];
+        if (p->dof) at = tss__reduced_column(j->e, at);
+        if (at < 0) continue;
+        for (size_t a = 0; a < (size_t)p->cols; a++)
+            rows[a * p->coords + (size_t)at] = value && a == 0 ? value[h] : 0;
+    }
+}
+
+static int tss__held_fits(const tss_held *h, const tss_net *n) {
+    for (int k = 0; h && k < h->count; k++)
+        if (h->index[k] < 0 || h->index[k] >= n->outputs) return 0;
+    return !h || (h->count >= 0 && (h->count == 0 || h->value));
+}
 
 static int tss__n_fits(const tss_net *n, const tss_elements *e) {
     return !n->has_in && n->outputs == e->nodes * e->dim;
@@ -2301,7 +2351,10 @@ static void tss__reduced_elements(tss__n_reduced *j, int c) {
         t.alpha = j->alpha ? j->alpha[i] : j->all_alpha, t.beta = j->betas, t.gamma = j->gamma;
         t.bar = j->mode != TSS__CELL_VALUE ? p->xbar + row : NULL;
         t.scratch = j->cell_scratch + (size_t)c * (size_t)(3 * p->cols + 2) * TSS__N_CELL;
+        const double *held = j->held ? j->held->value + (size_t)i * (size_t)j->held->count : NULL;
+        tss__reduced_pin(j, p->x + row, held);
         tss__jet_run(&t);
+        if (t.bar) tss__reduced_pin(j, t.bar, NULL);
         if (j->P) j->P[i] = t.P;
         if (j->P2) j->P2[i] = t.P2;
     }
@@ -2337,8 +2390,9 @@ static void tss__n_identity(double *D, int r) {
     for (int a = 0; a < r; a++) D[a * r + a] = 1;
 }
 
-tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
-                                 const double *z, double *P, double *gradient, double *hessian) {
+static tss_result tss__reduced_potential(const tss_net *n, const tss_elements *e, tss_work *w,
+                                         const tss_held *held, int batch, const double *z,
+                                         double *P, double *gradient, double *hessian) {
     if (!tss__n_sizes(batch, hessian ? n->width[0] : 0) || !tss__n_fits(n, e))
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_reduced j;
@@ -2356,9 +2410,14 @@ tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_wo
         if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
     }
     if (hessian) tss__n_identity(D, r);
-    j.z = z, j.D = D, j.P = P, j.gradient = gradient, j.HD = hessian;
+    j.z = z, j.D = D, j.P = P, j.gradient = gradient, j.HD = hessian, j.held = held;
     tss__reduced_run(&j, w);
     return TSS_OK;
+}
+
+tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
+                                 const double *z, double *P, double *gradient, double *hessian) {
+    return tss__reduced_potential(n, e, w, NULL, batch, z, P, gradient, hessian);
 }
 
 tss_result tss_reduced_second(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
@@ -2577,6 +2636,7 @@ static void tss__lip_init(tss__n_lip *l, const tss_net *n, const tss_elements *e
                       batch, k1, NULL);
     tss__reduced_init(&l->second, n, e, TSS__CELL_REVERSE, batch, l->k,
                       order == 2 ? &marker : NULL);
+    l->first.held = l->second.held = def->held;
 }
 
 static void tss__lip_plan(tss__n_lip *l, tss__n_slab *s, int reverse, int theta) {
@@ -2693,7 +2753,7 @@ static int tss__lip_valid(const tss_net *n, const tss_elements *e, const tss_lip
                           int batch, const double *probe) {
     int random = d->estimator != TSS_LIPSCHITZ_EXACT;
     return batch >= 2 && tss__n_sizes(batch, d->order == 2 ? n->width[0] : 2) &&
-           tss__n_fits(n, e) && d->order >= 0 && d->order <= 2 &&
+           tss__n_fits(n, e) && tss__held_fits(d->held, n) && d->order >= 0 && d->order <= 2 &&
            (unsigned)d->estimator <= TSS_LIPSCHITZ_U && d->floor >= 0 && d->floor < 1e300 &&
            (!random || (d->order == 2 && probe && d->probes >= 1 && d->probes <= n->width[0]));
 }
@@ -2738,8 +2798,14 @@ static void tss__lip_max_task(int i, int worker, void *arg) {
 
 tss_result tss_lipschitz_estimate(const tss_net *dec, const tss_elements *e, tss_work *w, int order,
                                   int batch, const double *z, double *out) {
+    return tss_lipschitz_estimate_held(dec, e, w, order, NULL, batch, z, out);
+}
+
+tss_result tss_lipschitz_estimate_held(const tss_net *dec, const tss_elements *e, tss_work *w,
+                                       int order, const tss_held *held, int batch, const double *z,
+                                       double *out) {
     tss_lipschitz_def def = tss_lipschitz_def_default();
-    def.order = order;
+    def.order = order, def.held = held;
     if (!tss__lip_valid(dec, e, &def, batch, NULL)) return TSS_ERROR_BAD_ARGUMENT;
     tss__n_lip l;
     tss__n_slab s = {NULL, 0, 0};
@@ -2765,7 +2831,9 @@ tss_result tss_lipschitz_estimate(const tss_net *dec, const tss_elements *e, tss
 // ---------------------------------------------------------------------------------------------
 
 tss_cubature_def tss_cubature_def_default(void) {
-    tss_cubature_def d = {300, 0, 0, 0};
+    tss_cubature_def d;
+    memset(&d, 0, sizeof d);
+    d.count = 300;
     return d;
 }
 
@@ -2959,15 +3027,20 @@ static void tss__cub_fill_task(int block, int worker, void *arg) {
 
 // b, G and norms. x: (1 + r)·n doubles, D: r² of them.
 static tss_result tss__cub_system(tss__cub *c, const tss_net *n, const tss_elements *e, tss_work *w,
-                                  int samples, const double *z, double *x, double *D) {
+                                  const tss_held *held, int samples, const double *z, double *x,
+                                  double *D) {
     size_t r = (size_t)n->inputs, coords = (size_t)n->outputs;
-    tss_result result = tss_reduced_potential(n, e, w, samples, z, NULL, c->b, NULL);
+    tss_result result = tss__reduced_potential(n, e, w, held, samples, z, NULL, c->b, NULL);
     tss__n_identity(D, (int)r);
     for (size_t t = 0; result == TSS_OK && t < (size_t)samples; t++) {
         double *b = c->b + t * r, size = sqrt(tss__dot_n((int)r, b, b));
         tss__cub_fill f = {c, e, x, (int)r, coords, t * r, size > 0 ? 1 / size : 0};
         for (size_t a = 0; a < r; a++) b[a] *= f.scale;
         result = tss_net_jets(n, w, 1, (int)r, z + t * r, D, NULL, x, x + coords, NULL);
+        for (size_t h = 0; held && h < (size_t)held->count; h++)
+            for (size_t a = 0; a <= r; a++)
+                x[a * coords + (size_t)held->index[h]] =
+                    a ? 0 : held->value[t * (size_t)held->count + h];
         if (result == TSS_OK)
             tss_parallel(&w->host, (c->candidates + 63) / 64, tss__cub_fill_task, &f);
     }
@@ -3008,7 +3081,8 @@ tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work
                                int *subset, double *weight, int *count, double *error) {
     *count = 0;
     if (!tss__n_fits(n, e) || samples < 1 || def->count < 1 || def->candidates < 0 ||
-        !(def->tol >= 0) || !tss__n_sizes(samples, n->inputs) || (double)samples * n->inputs > 1e9)
+        !(def->tol >= 0) || !tss__held_fits(def->held, n) || !tss__n_sizes(samples, n->inputs) ||
+        (double)samples * n->inputs > 1e9)
         return TSS_ERROR_BAD_ARGUMENT;
     tss__cub c;
     tss__n_slab s = {NULL, 0, 0};
@@ -3028,7 +3102,7 @@ tss_result tss_cubature_select(const tss_net *n, const tss_elements *e, tss_work
     s.used = 0, s.want = 0;
     tss__cub_carve(&c, &s, r, (size_t)n->outputs, &x, &D);
     tss__cub_draw(&c, e, def->seed);
-    tss_result result = tss__cub_system(&c, n, e, w, samples, z, x, D);
+    tss_result result = tss__cub_system(&c, n, e, w, def->held, samples, z, x, D);
     if (result == TSS_OK && !isfinite(tss__dot_n((int)c.m, c.b, c.b)))
         result = TSS_ERROR_BAD_ARGUMENT;
     if (result == TSS_OK) {
@@ -3478,6 +3552,7 @@ struct tss_training {
     double *p;        // one block
     size_t bytes;
     double *g, *x, *z, *z_bar, *probe;  // gradients; a batch of frames; of z
+    double *held;                       // of a batch's frames
 };
 
 tss_training_def tss_training_def_default(void) {
@@ -3514,6 +3589,9 @@ static const char *tss__training_complaint(const tss_training_def *d) {
     if (lip && !tss__lip_valid(dec, d->cubature ? d->cubature : d->elements, &d->lipschitz,
                                d->lipschitz_batch, d->frames ? d->frames : &d->sigma))
         return "training: the Lipschitz loss is out of range";
+    tss_held held = {d->held_count, d->held, &d->sigma};
+    if (d->held_count && (!enc || !d->held || !tss__held_fits(&held, dec)))
+        return "training: held coordinates out of range, or without frames";
     if (!tss__adam_valid(&d->adam)) return "training: Adam out of range";
     if (m->adam && m->adam->count != dec->theta[dec->layers] + (enc ? enc->theta[enc->layers] : 0))
         return "training: the optimiser does not fit the networks";
@@ -3535,11 +3613,12 @@ static int tss__training_arrays(tss_training *t) {
     int most = t->def.batch > t->def.lipschitz_batch ? t->def.batch : t->def.lipschitz_batch;
     size_t rows = (size_t)most, r = (size_t)dec->inputs, n = enc ? (size_t)dec->outputs : 0;
     t->dec = dec->theta[dec->layers], t->enc = enc ? enc->theta[enc->layers] : 0;
-    t->bytes = (t->dec + t->enc + rows * (n + 2 * r) + 2 * r * r) * sizeof(double);
+    size_t held = (size_t)t->def.held_count;
+    t->bytes = (t->dec + t->enc + rows * (n + 2 * r + held) + 2 * r * r) * sizeof(double);
     t->p = (double *)tss_alloc(&t->host, t->bytes);
     if (!t->p) return 0;
     t->g = t->p, t->x = t->g + t->dec + t->enc, t->z = t->x + rows * n, t->z_bar = t->z + rows * r;
-    t->probe = t->z_bar + rows * r;
+    t->probe = t->z_bar + rows * r, t->held = t->probe + 2 * r * r;
     return tss_work_create(&t->host, &t->work) == TSS_OK &&
            (t->def.model->adam || tss_adam_create(&t->host, &t->def.adam, t->dec + t->enc,
                                                   &t->def.model->adam) == TSS_OK);
@@ -3598,21 +3677,27 @@ static tss_result tss__training_lipschitz(tss_training *t, tss_training_info *in
     const tss_training_def *d = &t->def;
     const tss_model *m = d->model;
     int B = d->lipschitz_batch, r = m->decoder->inputs;
+    tss_held held = {d->held_count, d->held, t->held};
+    tss_lipschitz_def ld = d->lipschitz;
+    ld.held = d->held_count ? &held : NULL;
     double *probe = d->lipschitz.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe;
     double *z_bar = m->encoder && d->through_encoder ? t->z_bar : NULL;
     tss_result result = TSS_OK;
     if (m->encoder) {
         tss__training_frames(t, B);
         result = tss_net_forward(m->encoder, t->work, B, t->x, t->z);
+        for (int i = 0, n = d->held_count; i < B * n; i++)
+            t->held[i] =
+                t->x[(size_t)(i / n) * (size_t)m->decoder->outputs + (size_t)d->held[i % n]];
     } else {
         tss__training_normals(t, t->z, B);
     }
     if (probe) tss__training_normals(t, probe, 2 * d->lipschitz.probes);
     if (z_bar) tss__n_zero(z_bar, (size_t)(B * r));
     if (result == TSS_OK)
-        result = tss_loss_lipschitz(m->decoder, d->cubature ? d->cubature : d->elements, t->work,
-                                    &d->lipschitz, B, t->z, probe, d->lipschitz_weight,
-                                    &info->lipschitz, t->g, z_bar);
+        result =
+            tss_loss_lipschitz(m->decoder, d->cubature ? d->cubature : d->elements, t->work, &ld, B,
+                               t->z, probe, d->lipschitz_weight, &info->lipschitz, t->g, z_bar);
     if (result == TSS_OK && z_bar)
         result = tss_net_backward(m->encoder, t->work, B, t->x, z_bar, t->g + t->dec, NULL);
     return result;

@@ -41,6 +41,7 @@ typedef struct neural {
     double lame[2];
     unsigned char *held;  // of each coordinate: not free
     int handles, *handle;  // nodes of all handles
+    int pinned, *pin;      // their coordinates if L_LS and Eq. 7 see them where frames have them, else 0
     tss_elements *elements, *cubature;
     tss_work *work;
     // Frames, coordinate after coordinate: sequences of d->script.length.
@@ -175,6 +176,9 @@ static int neural_open(run *r, neural *v) {
     neural_take_body(v);
     if (!neural_take_handles(v) || !neural_world(v, &r->w)) return 0;
     for (int i = 0; i < v->n; i++) v->mass[i] = tss_world_masses(r->w)[i / v->dim];
+    v->pinned = v->d->unsupervised || !v->d->lipschitz.handles ? 0 : v->dim * v->handles;
+    v->pin = (int *)need((size_t)(v->dim * v->handles), sizeof(int));
+    for (int i = 0; i < v->dim * v->handles; i++) v->pin[i] = v->dim * v->handle[i / v->dim] + i % v->dim;
     tss_elements_def d = neural_elements(v);
     tss_host host = tss_host_default();
     host.log = print_log, host.workers = r->o.threads;
@@ -183,11 +187,14 @@ static int neural_open(run *r, neural *v) {
     if (v->d->lipschitz.probes > v->d->r)
         return fail(r, "%s: neural.lipschitz.probes is %d, expected at most neural.r (%d)", r->o.scene,
                     v->d->lipschitz.probes, v->d->r);
+    if (v->d->lipschitz.window && v->d->lipschitz.batch % 4)
+        return fail(v->r, "%s: neural.lipschitz.batch is %d, expected a multiple of 4 with window", v->r->o.scene,
+                    v->d->lipschitz.batch);
     return 1;
 }
 
 static void neural_close(neural *v) {
-    free(v->X), free(v->x0), free(v->mass), free(v->cell), free(v->held), free(v->handle), free(v->before);
+    free(v->X), free(v->x0), free(v->mass), free(v->cell), free(v->held), free(v->handle), free(v->pin), free(v->before);
     free(v->train), free(v->test), free(v->B), free(v->A), free(v->code), free(v->code_test);
     tss_elements_destroy(v->elements), tss_elements_destroy(v->cubature), tss_work_destroy(v->work);
 }
@@ -640,6 +647,21 @@ static double *neural_spread(const neural *v, const double *x, int frames, int c
     return out;
 }
 
+// Where frames (count × n) have the handles; value: count × v->pinned.
+static void neural_pinned(const neural *v, const double *x, int count, double *value) {
+    for (int i = 0; i < count * v->pinned; i++)
+        value[i] = x[(size_t)v->n * (size_t)(i / v->pinned) + (size_t)v->pin[i % v->pinned]];
+}
+
+static tss_result neural_eq7(neural *v, const tss_model *m, const tss_elements *e, int pinned, int count, const double *x, const double *z, double *lip) {
+    double *value = (double *)need((size_t)count * (size_t)v->pinned, sizeof *value);
+    tss_held held = {v->pinned, v->pin, value};
+    if (pinned) neural_pinned(v, x, count, value);
+    tss_result r = tss_lipschitz_estimate_held(m->decoder, e, v->work, 2, pinned && v->pinned ? &held : NULL, count, z, lip);
+    free(value);
+    return r;
+}
+
 static int neural_cubature(neural *v, const tss_model *base, double *seconds) {
     const scene_neural *d = v->d;
     double began = now(NULL), error;
@@ -650,7 +672,10 @@ static int neural_cubature(neural *v, const tss_model *base, double *seconds) {
     int *subset = (int *)need((size_t)d->lipschitz.cubature, sizeof *subset);
     double *weight = (double *)need((size_t)d->lipschitz.cubature, sizeof *weight);
     tss_cubature_def c = tss_cubature_def_default();
-    c.count = d->lipschitz.cubature, c.seed = (uint64_t)v->r->o.seed;
+    double *value = (double *)need((size_t)d->lipschitz.samples * (size_t)v->pinned, sizeof *value);
+    tss_held held = {v->pinned, v->pin, value};
+    neural_pinned(v, x, d->lipschitz.samples, value);
+    c.count = d->lipschitz.cubature, c.seed = (uint64_t)v->r->o.seed, c.held = v->pinned ? &held : NULL;
     tss_result e = tss_cubature_select(base->decoder, v->elements, v->work, &c, d->lipschitz.samples, z, subset, weight, &count, &error);
     tss_elements_def ed = neural_elements(v);
     ed.count = count, ed.subset = subset, ed.weight = weight;
@@ -658,7 +683,7 @@ static int neural_cubature(neural *v, const tss_model *base, double *seconds) {
     ok = e == TSS_OK ? 1 : fail(v->r, "%s: neural.lipschitz.cubature: %s", v->r->o.scene, tss_result_text(e));
     *seconds = now(NULL) - began;
     if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", count, v->cells, error, *seconds);
-    free(x), free(z), free(subset), free(weight);
+    free(x), free(z), free(subset), free(weight), free(value);
     return ok;
 }
 
@@ -673,7 +698,8 @@ typedef struct neural_trainer {
     uint64_t first, last;  // steps of the phase: from, to
     tss_net *decoder, *encoder;  // the MLPs alone: c of z, z of c. Supervised
     tss_training *t;             // unsupervised
-    double *g, *c, *c2, *z, *z_bar, *z_mean, *probe, *z_test;
+    double *g, *c, *c2, *z, *z_bar, *z_mean, *probe, *z_test, *pin;
+    int *drawn;  // frames of c2
     double loss, lipschitz, lip, rate;  // running means of the losses
     double seconds;
     int skipped;
@@ -699,9 +725,10 @@ static tss_lipschitz_def neural_lipschitz(const neural *v) {
     return d;
 }
 
-static void neural_draw(const neural *v, tss_rng *rng, int count, double *c) {
+static void neural_draw(const neural *v, tss_rng *rng, int count, double *c, int *drawn) {
     for (int k = 0; k < count; k++) {
         int f = (int)(tss_rng_uniform(rng) * v->trains);
+        if (drawn) drawn[k] = f;
         memcpy(c + (size_t)k * (size_t)v->p, v->code + (size_t)f * (size_t)v->p, (size_t)v->p * sizeof *c);
     }
 }
@@ -717,6 +744,25 @@ static double neural_z_scale(const double *z, int count, int r, double *mean) {
     return sqrt(s);
 }
 
+// Frames of a batch and where their handles are. lipschitz.window W > 0: groups of NEURAL_GROUP frames,
+// those of a group within W of its first and with its handles: all states of the one E of a step.
+#define NEURAL_GROUP 4
+static void neural_draw_lipschitz(neural_trainer *t) {
+    neural *v = t->v;
+    int batch = v->d->lipschitz.batch, W = v->d->lipschitz.window, length = v->d->script.length;
+    neural_draw(v, &t->m.rng, batch, t->c2, t->drawn);
+    for (int i = 0; i < batch; i++) {
+        int lead = W > 0 ? t->drawn[i - i % NEURAL_GROUP] : t->drawn[i];
+        if (W > 0 && i % NEURAL_GROUP) {
+            int first = lead - lead % length, lo = lead - W > first ? lead - W : first;
+            int hi = lead + W < first + length ? lead + W : first + length - 1;
+            t->drawn[i] = lo + (int)((hi - lo + 1) * tss_rng_uniform(&t->m.rng));
+            memcpy(t->c2 + (size_t)i * (size_t)v->p, v->code + (size_t)t->drawn[i] * (size_t)v->p, (size_t)v->p * sizeof *t->c2);
+        }
+        neural_pinned(v, v->train + (size_t)v->n * (size_t)lead, 1, t->pin + i * v->pinned);
+    }
+}
+
 // L_LS of a batch of frames of their own; its gradient is added to g. lipschitz.relative: L_LS is
 // multiplied by s^(2(o + 1)), s the spread of the batch's z: else it falls when z is but stretched.
 static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double *loss) {
@@ -724,18 +770,22 @@ static tss_result neural_step_lipschitz(neural_trainer *t, double weight, double
     const scene_neural *d = v->d;
     size_t dec = neural_parameters(t->decoder);
     tss_lipschitz_def ld = neural_lipschitz(v);
-    int batch = d->lipschitz.batch, r = d->r;
-    neural_draw(v, &t->m.rng, batch, t->c2);
+    int batch = d->lipschitz.batch, r = d->r, each = d->lipschitz.window ? NEURAL_GROUP : batch, groups = batch / each;
+    neural_draw_lipschitz(t);
     for (int i = 0; i < 2 * r * ld.probes && ld.estimator != TSS_LIPSCHITZ_EXACT; i++) t->probe[i] = tss_rng_normal(&t->m.rng);
     memset(t->z_bar, 0, (size_t)batch * (size_t)r * sizeof *t->z_bar);
     tss_result e = tss_net_forward(t->encoder, v->work, batch, t->c2, t->z);
     double spread = d->lipschitz.relative ? neural_z_scale(t->z, batch, r, t->z_mean) : 1;
-    double power = 2 * (ld.order + 1), unit = pow(spread, power);
-    weight *= unit;
-    if (e == TSS_OK)
-        e = tss_loss_lipschitz(t->m.decoder, v->cubature ? v->cubature : v->elements, v->work, &ld, batch, t->z,
-                               ld.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe, weight, loss, t->g,
-                               d->lipschitz.through_encoder ? t->z_bar : NULL);
+    double power = 2 * (ld.order + 1), unit = pow(spread, power), part;
+    weight *= unit, *loss = 0;
+    for (int g = 0; g < groups && e == TSS_OK; g++) {
+        tss_held held = {v->pinned, v->pin, t->pin + g * each * v->pinned};
+        ld.held = v->pinned ? &held : NULL;
+        e = tss_loss_lipschitz(t->m.decoder, v->cubature ? v->cubature : v->elements, v->work, &ld, each, t->z + g * each * r,
+                               ld.estimator == TSS_LIPSCHITZ_EXACT ? NULL : t->probe, weight / groups, &part, t->g,
+                               d->lipschitz.through_encoder ? t->z_bar + g * each * r : NULL);
+        *loss += part / groups;
+    }
     for (int i = 0; d->lipschitz.relative && i < batch * r; i++)
         t->z_bar[i] += weight * *loss * power * (t->z[i] - t->z_mean[i % r]) / (batch * r * spread * spread);
     *loss *= unit;
@@ -756,7 +806,7 @@ static tss_result neural_step(neural_trainer *t, tss_training_info *info) {
     double weight = t->phase == NEURAL_LIPSCHITZ ? v->d->lipschitz.weight : 0;
     memset(info, 0, sizeof *info);
     memset(t->g, 0, (dec + enc) * sizeof *t->g);
-    neural_draw(v, &t->m.rng, v->d->train.batch, t->c);
+    neural_draw(v, &t->m.rng, v->d->train.batch, t->c, NULL);
     tss_result e = tss_loss_reconstruction(t->decoder, t->encoder, v->work, NULL, v->d->train.batch, t->c, 1, &info->loss, t->g, t->g + dec);
     if (e == TSS_OK && weight > 0) e = neural_step_lipschitz(t, weight, &info->lipschitz);
     for (size_t i = 0; i < dec + enc; i++) info->skipped |= !isfinite(t->g[i]);
@@ -780,6 +830,7 @@ static int neural_trainer_supervised(neural_trainer *t) {
     t->c = (double *)need((size_t)v->d->train.batch * p, sizeof(double)), t->c2 = (double *)need(batch * p, sizeof(double));
     t->z = (double *)need(batch * r, sizeof(double)), t->z_bar = (double *)need(batch * r, sizeof(double));
     t->z_mean = (double *)need(r, sizeof(double));
+    t->pin = (double *)need(batch * (size_t)v->pinned, sizeof(double)), t->drawn = (int *)need(batch, sizeof(int));
     t->probe = (double *)need(2 * r * (size_t)v->d->lipschitz.probes, sizeof(double));
     return 1;
 }
@@ -846,7 +897,7 @@ static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t)
 static void neural_trainer_close(neural_trainer *t) {
     tss_model_free(&t->m);
     tss_training_destroy(t->t), tss_net_destroy(t->decoder), tss_net_destroy(t->encoder);
-    free(t->g), free(t->c), free(t->c2), free(t->z), free(t->z_bar), free(t->z_mean), free(t->probe), free(t->z_test);
+    free(t->g), free(t->c), free(t->c2), free(t->z), free(t->z_bar), free(t->z_mean), free(t->probe), free(t->z_test), free(t->pin), free(t->drawn);
     if (t->rows) fclose(t->rows);
 }
 
@@ -856,7 +907,7 @@ static int neural_checkpoint(neural_trainer *t) {
     char path[700];
     double *z = neural_z(v, &t->m, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     const tss_elements *e = v->cubature ? v->cubature : v->elements;
-    (void)tss_lipschitz_estimate(t->m.decoder, e, v->work, 2, NEURAL_SAMPLES, z, &t->lip);
+    (void)neural_eq7(v, &t->m, e, 1, NEURAL_SAMPLES, t->z_test, z, &t->lip);
     fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
             t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped);
     fflush(t->rows), free(z), free(mean);
@@ -933,13 +984,13 @@ typedef struct neural_entry {
     int *iterations, *evaluations, *exit;
     // Distance of the tests' states from the nearest that the decoder reaches, over the diagonal.
     double projection_mean, projection_farthest;
-    double lip, z_scale, train_seconds;  // Eq. 7; spread of z: lip · spread³ does not see z stretched
+    double lip, lip_decoder, z_scale, train_seconds;  // Eq. 7, with handles and without; spread of z: lip · spread³ does not see z stretched
 } neural_entry;
 
 typedef struct neural_trial {
     neural *v;
     neural_entry e[NEURAL_TRIALS];
-    int steps;
+    int steps, first;  // first sequence: 0, or behind those of training (validate)
     double diagonal, *room, *force, *target;
 } neural_trial;
 
@@ -994,6 +1045,17 @@ static int neural_trial_open(neural *v, neural_trial *t) {
     t->v = v;
     if (!neural_frames(v)) return 0;
     if (v->stopped) return fail(v->r, "%s/frames.bin: not all frames are there yet", v->r->o.out);
+    if (v->d->script.validate) {
+        neural_start start;
+        int failed = 0;
+        size_t each = (size_t)v->n * (size_t)v->d->script.length;
+        start.data = save_world(v->r->w, &start.size);
+        t->first = v->d->script.test + v->d->script.train;
+        for (int k = 0, ok = 1; ok && k < v->d->script.test; k++) ok = neural_sequence(v, &start, t->first + k, v->test + (size_t)k * each, &failed);
+        int ok = load_world(v->r, v->r->w, start.data, start.size);
+        free(start.data);
+        if (!ok || v->r->why.text[0]) return 0;
+    }
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
     t->steps = v->d->script.test * (v->d->script.length / v->d->script.stride);
     if (v->d->script.stride > v->d->script.length || (v->h > 0 && v->d->script.stride > 1))
@@ -1066,7 +1128,7 @@ typedef int neural_watch(neural_trial *t, int sequence, int k, void *ctx);  // 0
 
 static int neural_trial_sequence(neural_trial *t, int number, const neural_start *start, neural_watch *watch, void *ctx) {
     neural *v = t->v;
-    neural_script s = neural_script_of(v, number);
+    neural_script s = neural_script_of(v, t->first + number);
     int ok = load_world(v->r, v->r->w, start->data, start->size);
     for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {
         if (!t->e[q].used) continue;
@@ -1169,7 +1231,8 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
     double *z = neural_z(v, &e->m, x, count);
-    tss_result r = tss_lipschitz_estimate(e->m.decoder, v->elements, v->work, 2, count, z, &e->lip);
+    tss_result r = neural_eq7(v, &e->m, v->elements, 1, count, x, z, &e->lip);
+    if (r == TSS_OK) r = neural_eq7(v, &e->m, v->elements, 0, count, x, z, &e->lip_decoder);
     double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     e->z_scale = neural_z_scale(z, count, v->d->r, mean);
     free(x), free(z), free(mean);
@@ -1203,18 +1266,18 @@ static int neural_rows(neural_trial *t) {
     if (!old)
         fputs("system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,"
               "exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,projection_max,simulation_max,"
-              "energy,z_scale,lip_relative,lipschitz_weight,solver\n", f);
+              "energy,z_scale,lip_relative,lipschitz_weight,solver,lip_decoder\n", f);
     for (int k = 0; k < NEURAL_TRIALS; k++) {
         const neural_entry *e = &t->e[k];
         if (!e->used) continue;
-        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s\n",
+        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s,%.6g\n",
                 sweep_name(v->r, name), neural_trial_names[k], v->r->o.seed, v->n, v->cells, k == NEURAL_TRIAL_FULL ? v->n : v->d->r,
                 1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n),
                 neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE), neural_exits(e, n, TSS_EXIT_LINE_SEARCH),
                 neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip, e->projection_mean,
                 neural_mean(e->mean, n), e->train_seconds, e->projection_farthest, neural_most(e->farthest, n),
                 neural_mean(e->energy, n), e->z_scale, e->lip * pow(e->z_scale, 3), k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
-                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind]);
+                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind], e->lip_decoder);
     }
     return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
 }
@@ -1227,9 +1290,11 @@ static int neural_evaluate(neural *v) {
     if (ok) neural_table(&t);
     if (ok) {
         const neural_entry *a = &t.e[NEURAL_TRIAL_VANILLA], *b = &t.e[NEURAL_TRIAL_LIPSCHITZ];
-        printf("speedup %.3f lip %.3f (relative to the spread of z %.3f) projection %.3f simulation %.3f (vanilla over lipschitz, the last two the other way)\n",
-               neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps), a->lip / b->lip,
-               a->lip * pow(a->z_scale, 3) / (b->lip * pow(b->z_scale, 3)),
+        printf("speedup %.3f evaluations %.3f lip %.3f (relative to the spread of z %.3f, without handles %.3f) projection %.3f simulation %.3f "
+               "(vanilla over lipschitz, the last two the other way)\n",
+               neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps),
+               neural_mean_of(a->evaluations, t.steps) / neural_mean_of(b->evaluations, t.steps), a->lip / b->lip,
+               a->lip * pow(a->z_scale, 3) / (b->lip * pow(b->z_scale, 3)), a->lip_decoder / b->lip_decoder,
                b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
         ok = neural_rows(&t);
     }

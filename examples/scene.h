@@ -110,7 +110,8 @@
     .script                what happens to the body, at random: {handles, pulls, hold: [least, most]
                            steps from target to target ([10, 20]), length: steps of a sequence (60),
                            train, test: sequences (10, 2), seed (1), stride: quasi-static, steps of
-                           the script in one of a subspace (1)}
+                           the script in one of a subspace (1), validate: evaluate on sequences
+                           behind those of training, not on the tests (false)}
      .handles[]            {lower, upper, metres: nodes, as in pins; translate, rotate: [[low x, y, z],
                            [high]], m, and degrees along the axis, about the middle of the nodes}
      .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
@@ -120,8 +121,10 @@
     .lipschitz             {steps (5000), weight (1e-3), batch (16), rate (1e-4), rate_end (1e-6),
                            warmup (0), order (2), estimator: exact | uv | u (u), probes (1), undivided
                            (false), through_encoder (true), relative: L_LS in units
-                           of the spread of z, supervised (false), cubature: cells, 0: all (0), samples:
-                           that choose them (64)}
+                           of the spread of z, supervised (false), handles: L_LS and Eq. 7 of P with
+                           handles where the frames have them, supervised (true), window: L_LS of
+                           groups of frames this near under one's handles (0: off), cubature: cells,
+                           0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
                            (10), max_line (128), max_iterations (1024)}
     .samples               of Eq. 7 (256)
@@ -241,7 +244,7 @@ typedef struct scene_neural {
     struct {
         scene_handle *handle;
         scene_pull *pull;
-        int handles, pulls, length, train, test, seed, stride;
+        int handles, pulls, length, train, test, seed, stride, validate;
         double hold[2];
     } script;
     struct {
@@ -253,7 +256,7 @@ typedef struct scene_neural {
         double rate, rate_end, lambda, sigma, eps;
     } train;
     struct {
-        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, cubature, samples;
+        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples;
         double rate, rate_end, weight;
     } lipschitz;
     struct {
@@ -1797,6 +1800,7 @@ static const scene__key scene__script_keys[] = {
     SCENE__INT(scene_neural, script.test, "test", 1, 1e6),
     SCENE__INT(scene_neural, script.seed, "seed", 0, 1e9),
     SCENE__INT(scene_neural, script.stride, "stride", 1, 1e6),
+    SCENE__OF(SCENE__FLAG, scene_neural, script.validate, "validate"),
     SCENE__END};
 static const scene__key scene__pca_keys[] = {
     SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000), SCENE__END};
@@ -1824,6 +1828,8 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.undivided, "undivided"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.through_encoder, "through_encoder"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.relative, "relative"),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.handles, "handles"),
+    SCENE__INT(scene_neural, lipschitz.window, "window", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
     SCENE__END};
@@ -1881,7 +1887,7 @@ static void scene__neural_defaults(scene_neural *n) {
     n->lipschitz.steps = 5000, n->lipschitz.batch = 16, n->lipschitz.rate = 1e-4;
     n->lipschitz.rate_end = 1e-6, n->lipschitz.weight = 1e-3, n->lipschitz.order = 2;
     n->lipschitz.estimator = 2, n->lipschitz.probes = 1, n->lipschitz.through_encoder = 1;
-    n->lipschitz.samples = 64;
+    n->lipschitz.samples = 64, n->lipschitz.handles = 1;
     n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9, n->solver.memory = 10;
     n->solver.max_line = 128, n->solver.max_iterations = 1024;
 }

@@ -776,6 +776,20 @@ static void check_losses(int dim, tss_activation a, int matrix) {
             check_loss(&c, name, z, gz, B * R, weight),
                 check_loss(&c, name, tss_net_parameters(dec), gd, nd, weight);
         }
+        if (kind >= 2) {  // some coordinates where a script has them, another place for each sample
+            int index[3] = {s.coords - 1, 0, 4};
+            double *value = doubles(3 * B);
+            for (int i = 0; i < 3 * B; i++) value[i] = s.X[index[i % 3]] + 0.2 * rnd();
+            tss_held held = {3, index, value};
+            c.lip.held = &held, c.lip.undivided = 0;
+            memset(gz, 0, B * R * sizeof *gz), memset(gd, 0, nd * sizeof *gd);
+            loss_run(&c, weight, gd, NULL, gz);
+            snprintf(name, sizeof name, "loss %d, held, activation %d, %dD, matrix %d", kind,
+                     (int)a, dim, matrix);
+            check_loss(&c, name, tss_net_parameters(dec), gd, nd, weight);
+            check_loss(&c, name, z, gz, B * R, weight);
+            free(value);
+        }
         free(gd), free(ge), free(gz);
     }
     tss_net_destroy(dec), tss_net_destroy(enc), scene_free(&s);
@@ -787,6 +801,157 @@ static void test_losses(void **state) {
     for (int dim = 2; dim <= 3; dim++)
         for (int a = 0; a < TSS_ACTIVATIONS; a++)
             for (int matrix = 0; matrix < 2; matrix++) check_losses(dim, (tss_activation)a, matrix);
+}
+
+// Held coordinates: the same as a decoder whose rows there are 0 and whose base is the value; with
+// a value for each sample, φ is what each sample has alone. All cells and a subset; the cubature
+// too.
+static void test_held(void **state) {
+    (void)state;
+    enum { R = 3, B = 4, P = 5, HELD = 4 };
+    for (int part = 0; part < 2; part++) {
+        scene s;
+        scene_make(&s, 3, 2, 1, 1);
+        if (part) {
+            int some[5] = {0, 2, 3, 5, 6};
+            tss_elements_def d = def_of(&s);
+            d.count = 5, d.subset = some;
+            tss_elements_destroy(s.e);
+            assert_int_equal(tss_elements_create(NULL, &d, &s.e), TSS_OK);
+        }
+        size_t n = (size_t)s.coords;
+        double *basis = randoms(n * P, 0.4), *pinned = doubles(n * P), *base = doubles(n),
+               *value = doubles(B * HELD), *z = randoms(B * R, 1), *probe = randoms(2 * R, 1),
+               loss[2], lip[2], error[2];
+        int index[HELD] = {7, 1, s.coords - 2, 12}, width[3] = {R, 6, P}, subset[2][4], count[2];
+        tss_net *net[2];
+        for (int k = 0; k < B * HELD; k++) value[k] = s.X[index[k % HELD]] + 0.1 * (k % HELD);
+        memcpy(pinned, basis, n * P * sizeof *basis), memcpy(base, s.X, n * sizeof *base);
+        for (int h = 0; h < HELD; h++) {
+            base[index[h]] = value[h];
+            for (int k = 0; k < P; k++) pinned[index[h] * P + k] = 0;
+        }
+        for (int k = 0; k < 2; k++) {
+            tss_net_def d = tss_net_def_default();
+            d.layers = 2, d.width = width, d.activation = TSS_SILU, d.seed = 5;
+            d.outputs = s.coords, d.out_base = k ? base : s.X, d.out_matrix = k ? pinned : basis;
+            assert_int_equal(tss_net_create(NULL, &d, &net[k]), TSS_OK);
+        }
+        tss_held held = {HELD, index, value};
+        for (int o = 0; o < 4; o++) {
+            double *g[2] = {doubles(count_of(net[0])), doubles(count_of(net[0]))},
+                   *gz[2] = {doubles(B * R), doubles(B * R)};
+            tss_lipschitz_def d = tss_lipschitz_def_default();
+            d.order = o < 3 ? o : 2, d.estimator = o < 3 ? TSS_LIPSCHITZ_EXACT : TSS_LIPSCHITZ_U;
+            for (int k = 0; k < 2; k++) {
+                d.held = k ? NULL : &held;
+                assert_int_equal(tss_loss_lipschitz(net[k], s.e, s.work, &d, B, z,
+                                                    o < 3 ? NULL : probe, 1, &loss[k], g[k], gz[k]),
+                                 TSS_OK);
+                tss_lipschitz_estimate_held(net[k], s.e, s.work, d.order, d.held, B, z, &lip[k]);
+            }
+            assert_true(fabs(loss[0] / loss[1] - 1) < 1e-11 && fabs(lip[0] / lip[1] - 1) < 1e-11);
+            for (size_t i = 0; i < count_of(net[0]); i++)
+                assert_true(fabs(g[0][i] - g[1][i]) <= 1e-9 * (fabs(g[1][i]) + loss[1]));
+            for (int i = 0; i < B * R; i++)
+                assert_true(fabs(gz[0][i] - gz[1][i]) <= 1e-9 * (fabs(gz[1][i]) + loss[1]));
+            free(g[0]), free(g[1]), free(gz[0]), free(gz[1]);
+        }
+        for (int k = 0; k < 2; k++) {
+            tss_cubature_def c = tss_cubature_def_default();
+            double weight[4];
+            c.count = 4, c.held = k ? NULL : &held;
+            assert_int_equal(tss_cubature_select(net[k], s.e, s.work, &c, B, z, subset[k], weight,
+                                                 &count[k], &error[k]),
+                             TSS_OK);
+        }
+        assert_true(count[0] == count[1] &&
+                    memcmp(subset[0], subset[1], (size_t)count[0] * sizeof(int)) == 0);
+        assert_true(fabs(error[0] - error[1]) < 1e-9);
+        index[0] = s.coords;  // out of range
+        assert_int_equal(tss_lipschitz_estimate_held(net[0], s.e, s.work, 2, &held, B, z, lip),
+                         TSS_ERROR_BAD_ARGUMENT);
+        index[0] = 7, held.value = NULL;
+        assert_int_equal(tss_lipschitz_estimate_held(net[0], s.e, s.work, 2, &held, B, z, lip),
+                         TSS_ERROR_BAD_ARGUMENT);
+        tss_net_destroy(net[0]), tss_net_destroy(net[1]), scene_free(&s);
+        free(basis), free(pinned), free(base), free(value), free(z), free(probe);
+    }
+}
+
+// One step of Adam with an eps so large that it goes down the gradient: Eq. (10) of the frames
+// drawn, held coordinates where each frame has them, against differences in all parameters of both
+// networks.
+typedef struct held_step {
+    scene *s;
+    tss_model m;
+    double *frames, *theta[2], *dir[2];
+    size_t count[2];
+    int held[2], drawn[9];
+} held_step;
+
+static double held_step_loss(void *ctx, double t) {
+    held_step *c = (held_step *)ctx;
+    enum { BATCH = 4, LIP = 5, R = 3 };
+    size_t n = (size_t)c->s->coords;
+    double *x = doubles(9 * n), z[LIP * R], value[LIP * 2], loss[2];
+    tss_net *net[2] = {c->m.decoder, c->m.encoder};
+    for (int k = 0; k < 2; k++)
+        move(tss_net_parameters(net[k]), c->theta[k], c->dir[k], t, c->count[k]);
+    for (int i = 0; i < 9; i++)
+        memcpy(x + (size_t)i * n, c->frames + (size_t)c->drawn[i] * n, n * sizeof *x);
+    tss_lipschitz_def d = tss_lipschitz_def_default();
+    tss_held held = {2, c->held, value};
+    for (int i = 0; i < 2 * LIP; i++)
+        value[i] = x[(size_t)(BATCH + i / 2) * n + (size_t)c->held[i % 2]];
+    d.held = &held;
+    tss_loss_reconstruction(net[0], net[1], c->s->work, c->s->mass, BATCH, x, 1, &loss[0], NULL,
+                            NULL);
+    tss_net_forward(net[1], c->s->work, LIP, x + BATCH * n, z);
+    tss_loss_lipschitz(net[0], c->s->e, c->s->work, &d, LIP, z, NULL, 1, &loss[1], NULL, NULL);
+    for (int k = 0; k < 2; k++)
+        memcpy(tss_net_parameters(net[k]), c->theta[k], c->count[k] * sizeof(double));
+    free(x);
+    return loss[0] + 0.3 * loss[1];
+}
+
+static void test_held_training(void **state) {
+    (void)state;
+    enum { R = 3, FRAMES = 7 };
+    scene s;
+    scene_make(&s, 2, 2, 1, 0);
+    held_step c = {.s = &s, .held = {s.coords - 1, 2}};
+    size_t n = (size_t)s.coords;
+    c.m.decoder = decoder_of(&s, R, TSS_SILU, 1, 3), c.m.encoder = encoder_of(&s, R, TSS_SILU),
+    c.m.rng = tss_rng_seed(4);
+    tss_net *net[2] = {c.m.decoder, c.m.encoder};
+    c.frames = doubles(FRAMES * n);
+    for (size_t i = 0; i < FRAMES * n; i++) c.frames[i] = s.X[i % n] + 0.2 * rnd();
+    for (int k = 0; k < 2; k++) {
+        c.count[k] = count_of(net[k]), c.theta[k] = doubles(c.count[k]),
+        c.dir[k] = randoms(c.count[k], 0.5);
+        memcpy(c.theta[k], tss_net_parameters(net[k]), c.count[k] * sizeof(double));
+    }
+    tss_rng draws = c.m.rng;
+    for (int i = 0; i < 9; i++) c.drawn[i] = (int)(tss_rng_uniform(&draws) * FRAMES);
+    tss_training_def d = tss_training_def_default();
+    tss_training *t;
+    d.model = &c.m, d.elements = s.e, d.mass = s.mass, d.frames = c.frames, d.frame_count = FRAMES;
+    d.batch = 4, d.lipschitz_batch = 5, d.lipschitz_weight = 0.3, d.held_count = 2, d.held = c.held;
+    d.adam.eps = 1e9, d.adam.rate = 1e6;
+    assert_int_equal(tss_training_create(NULL, &d, &t), TSS_OK);
+    assert_int_equal(tss_training_step(t, NULL), TSS_OK);
+    double slope = 0;
+    for (int k = 0; k < 2; k++)
+        for (size_t i = 0; i < c.count[k]; i++)
+            slope += (c.theta[k][i] - tss_net_parameters(net[k])[i]) * 1e3 * c.dir[k][i];
+    double size = held_step_loss(&c, 0);
+    check_slope("training, held", held_step_loss, &c, slope, fabs(slope) + 0.1 * size, 1e-5);
+    tss_training_destroy(t);
+    c.held[0] = s.coords;
+    assert_int_equal(tss_training_create(NULL, &d, &t), TSS_ERROR_BAD_ARGUMENT);
+    for (int k = 0; k < 2; k++) free(c.theta[k]), free(c.dir[k]);
+    free(c.frames), tss_model_free(&c.m), scene_free(&s);
 }
 
 // Values of all losses from their formulas, with Hessians and positions of the public functions.
@@ -1736,9 +1901,9 @@ int main(void) {
         T(test_activations),  T(test_forward),        T(test_initial),       T(test_backward),
         T(test_net_jets),     T(test_potential),      T(test_subset),        T(test_element_jets),
         T(test_density),      T(test_reduced),        T(test_losses),        T(test_loss_values),
-        T(test_unbiased),     T(test_threads),        T(test_adam),          T(test_files),
-        T(test_paths),        T(test_resume),         T(test_refusals),      T(test_no_memory),
-        T(test_huge_gradient), T(test_cubature_tie),
+        T(test_held),         T(test_held_training),  T(test_unbiased),      T(test_threads),
+        T(test_adam),         T(test_files),          T(test_paths),         T(test_resume),
+        T(test_refusals),     T(test_no_memory),      T(test_huge_gradient), T(test_cubature_tie),
         T(test_cubature),     T(test_reduced_solver), T(test_reduced_exits), T(test_autoencoder),
         T(test_unsupervised),
     };
