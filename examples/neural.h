@@ -3,6 +3,7 @@
    tss neural train    SCENE [-o DIR] [--seed N] [--minutes M] [--method vanilla|lipschitz] ...
    tss neural run      SCENE [-o DIR] [--seed N] ...
    tss neural evaluate SCENE [-o DIR] [--seed N] ...
+   tss neural measure  SCENE [-o DIR] [--seed N] ...
 
    The scene's section "neural" (scene.h) says what is learned of its first body, and what happens to
    it, at random: handles (nodes that are told where to be) and pulls (forces). Full space and
@@ -20,6 +21,9 @@
    run     the test sequences in full space and in each subspace: steps_N.csv, pictures, report.html
    evaluate the same, and Eq. 7 and projections of the test's states: a row a method is appended to
            DIR/evaluate.csv
+
+   measure what the cubature misses on the base, and what a training step costs: a row to
+           DIR/measure.csv
 
    Eq. 3 costs only as much as the networks: x = x0 + B c with BᵀMB = s² I, so that ‖Δx‖²_M is s²‖Δc‖²
    but for what B does not reach, which no θ alters. Training sees c. s² is the mean of ‖x − x0‖²_M,
@@ -640,24 +644,31 @@ static double *neural_spread(const neural *v, const double *x, int frames, int c
     return out;
 }
 
-static int neural_cubature(neural *v, const tss_model *base, double *seconds) {
+typedef struct neural_selection {
+    int cells;             // chosen
+    double error, seconds; // relative, of the samples' gradients
+} neural_selection;
+
+// At most `most` cells that stand for all of them in the subspace of a model; 0 or all: *out stays.
+static int neural_cubature(neural *v, const tss_model *base, int most, tss_elements **out, neural_selection *s) {
     const scene_neural *d = v->d;
-    double began = now(NULL), error;
-    int count, ok;
-    if (d->lipschitz.cubature == 0 || d->lipschitz.cubature >= v->cells) return 1;
+    double began = now(NULL);
+    int ok;
+    s->cells = v->cells, s->error = s->seconds = 0;
+    if (most == 0 || most >= v->cells) return 1;
     double *x = neural_spread(v, v->train, v->trains, d->lipschitz.samples);
     double *z = neural_z(v, base, x, d->lipschitz.samples);
-    int *subset = (int *)need((size_t)d->lipschitz.cubature, sizeof *subset);
-    double *weight = (double *)need((size_t)d->lipschitz.cubature, sizeof *weight);
+    int *subset = (int *)need((size_t)most, sizeof *subset);
+    double *weight = (double *)need((size_t)most, sizeof *weight);
     tss_cubature_def c = tss_cubature_def_default();
-    c.count = d->lipschitz.cubature, c.seed = (uint64_t)v->r->o.seed;
-    tss_result e = tss_cubature_select(base->decoder, v->elements, v->work, &c, d->lipschitz.samples, z, subset, weight, &count, &error);
+    c.count = most, c.seed = (uint64_t)v->r->o.seed;
+    tss_result e = tss_cubature_select(base->decoder, v->elements, v->work, &c, d->lipschitz.samples, z, subset, weight, &s->cells, &s->error);
     tss_elements_def ed = neural_elements(v);
-    ed.count = count, ed.subset = subset, ed.weight = weight;
-    if (e == TSS_OK) e = tss_elements_create(NULL, &ed, &v->cubature);
-    ok = e == TSS_OK ? 1 : fail(v->r, "%s: neural.lipschitz.cubature: %s", v->r->o.scene, tss_result_text(e));
-    *seconds = now(NULL) - began;
-    if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", count, v->cells, error, *seconds);
+    ed.count = s->cells, ed.subset = subset, ed.weight = weight;
+    s->seconds = now(NULL) - began;
+    if (e == TSS_OK) e = tss_elements_create(NULL, &ed, out);
+    ok = e == TSS_OK ? 1 : fail(v->r, "%s: cubature: %s", v->r->o.scene, tss_result_text(e));
+    if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", s->cells, v->cells, s->error, s->seconds);
     free(x), free(z), free(subset), free(weight);
     return ok;
 }
@@ -902,14 +913,14 @@ static int neural_train_phase(neural *v, neural_phase phase) {
 
 static int neural_train(neural *v) {
     const char *only = v->r->o.method;
-    double seconds = 0;
+    neural_selection chosen;
     tss_model base;
     int there;
     if (!neural_frames(v) || v->stopped) return !v->r->why.text[0];
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
     if (!neural_train_phase(v, NEURAL_BASE) || v->stopped) return !v->r->why.text[0];
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
-    int ok = neural_cubature(v, &base, &seconds);
+    int ok = neural_cubature(v, &base, v->d->lipschitz.cubature, &v->cubature, &chosen);
     tss_model_free(&base);
     if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
     if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
@@ -927,13 +938,14 @@ typedef struct neural_entry {
     int used;
     tss_model m;
     tss_reduced *s;
+    tss_elements *cells;  // solver.cubature; NULL: all
     // Of each step of the tests: s (the shortest of --repeat), counts, exit, and what remains of the
     // gradient, J; distance from full space over the diagonal, of all nodes and the farthest.
     double *seconds, *gradient, *energy, *mean, *farthest;
     int *iterations, *evaluations, *exit;
     // Distance of the tests' states from the nearest that the decoder reaches, over the diagonal.
     double projection_mean, projection_farthest;
-    double lip, z_scale, train_seconds;  // Eq. 7; spread of z: lip · spread³ does not see z stretched
+    double lip[3], z_scale, train_seconds;  // Eq. 7 and its orders 0 and 1 (Eq. 12); spread of z: lip · spread³ does not see z stretched
 } neural_entry;
 
 typedef struct neural_trial {
@@ -976,8 +988,10 @@ static int neural_entry_open(neural_trial *t, int which) {
     if (!there)
         return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
                     v->r->o.seed, v->r->o.scene);
+    neural_selection chosen;
+    if (!neural_cubature(v, &e->m, d->solver.cubature, &e->cells, &chosen)) return 0;
     tss_reduced_def rd = tss_reduced_def_default();
-    rd.decoder = e->m.decoder, rd.elements = v->elements, rd.mass = v->mass, rd.h = v->h;
+    rd.decoder = e->m.decoder, rd.elements = e->cells ? e->cells : v->elements, rd.mass = v->mass, rd.h = v->h;
     rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
     rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
     tss_host host = tss_host_default();
@@ -1012,7 +1026,7 @@ static int neural_trial_open(neural *v, neural_trial *t) {
 
 static void neural_trial_close(neural_trial *t) {
     for (int k = 0; k < NEURAL_TRIALS; k++) {
-        tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m);
+        tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m), tss_elements_destroy(t->e[k].cells);
         free(t->e[k].seconds), free(t->e[k].iterations);
     }
     free(t->room);
@@ -1135,7 +1149,7 @@ static void neural_table(const neural_trial *t) {
         printf("%-10s %9.3f %7.1f %7.1f %24s %10.3g %10.5g %10.3g %10.3g %10.3g %9.4g\n", neural_trial_names[k],
                1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n), exits,
                neural_mean(e->gradient, n), neural_mean(e->energy, n), neural_mean(e->mean, n), neural_most(e->farthest, n),
-               e->projection_mean, e->lip);
+               e->projection_mean, e->lip[2]);
     }
 }
 
@@ -1169,7 +1183,8 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
     double *z = neural_z(v, &e->m, x, count);
-    tss_result r = tss_lipschitz_estimate(e->m.decoder, v->elements, v->work, 2, count, z, &e->lip);
+    tss_result r = TSS_OK;
+    for (int o = 0; o < 3 && r == TSS_OK; o++) r = tss_lipschitz_estimate(e->m.decoder, v->elements, v->work, o, count, z, &e->lip[o]);
     double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     e->z_scale = neural_z_scale(z, count, v->d->r, mean);
     free(x), free(z), free(mean);
@@ -1203,18 +1218,19 @@ static int neural_rows(neural_trial *t) {
     if (!old)
         fputs("system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,"
               "exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,projection_max,simulation_max,"
-              "energy,z_scale,lip_relative,lipschitz_weight,solver\n", f);
+              "energy,z_scale,lip_relative,lipschitz_weight,solver,lip_0,lip_1,order,eps,runtime_cells\n", f);
     for (int k = 0; k < NEURAL_TRIALS; k++) {
         const neural_entry *e = &t->e[k];
         if (!e->used) continue;
-        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s\n",
+        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s,%.6g,%.6g,%d,%g,%d\n",
                 sweep_name(v->r, name), neural_trial_names[k], v->r->o.seed, v->n, v->cells, k == NEURAL_TRIAL_FULL ? v->n : v->d->r,
                 1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n),
                 neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE), neural_exits(e, n, TSS_EXIT_LINE_SEARCH),
-                neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip, e->projection_mean,
+                neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip[2], e->projection_mean,
                 neural_mean(e->mean, n), e->train_seconds, e->projection_farthest, neural_most(e->farthest, n),
-                neural_mean(e->energy, n), e->z_scale, e->lip * pow(e->z_scale, 3), k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
-                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind]);
+                neural_mean(e->energy, n), e->z_scale, e->lip[2] * pow(e->z_scale, 3), k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
+                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind], e->lip[0], e->lip[1],
+                v->d->lipschitz.order, v->d->solver.eps, e->cells ? v->d->solver.cubature : v->cells);
     }
     return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
 }
@@ -1228,12 +1244,133 @@ static int neural_evaluate(neural *v) {
     if (ok) {
         const neural_entry *a = &t.e[NEURAL_TRIAL_VANILLA], *b = &t.e[NEURAL_TRIAL_LIPSCHITZ];
         printf("speedup %.3f lip %.3f (relative to the spread of z %.3f) projection %.3f simulation %.3f (vanilla over lipschitz, the last two the other way)\n",
-               neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps), a->lip / b->lip,
-               a->lip * pow(a->z_scale, 3) / (b->lip * pow(b->z_scale, 3)),
+               neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps), a->lip[2] / b->lip[2],
+               a->lip[2] * pow(a->z_scale, 3) / (b->lip[2] * pow(b->z_scale, 3)),
                b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
         ok = neural_rows(&t);
     }
     neural_trial_close(&t);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_measure: the cubature against all cells on the base, at states that did not choose it, and
+// what a step of training costs without L_LS, with it, and with it on the cubature. CPU seconds of
+// this thread, the three in turns, the shortest of each: others on the machine count little.
+// ---------------------------------------------------------------------------------------------
+
+#define NEURAL_TURNS 12  // of training steps
+
+// ‖a − b‖ / ‖b‖ of a vector a state, the mean.
+static double neural_relative(int count, int width, const double *a, const double *b) {
+    double mean = 0;
+    for (int k = 0; k < count; k++) {
+        double d = 0, n = 0;
+        for (int i = k * width; i < (k + 1) * width; i++) d += (a[i] - b[i]) * (a[i] - b[i]), n += b[i] * b[i];
+        mean += n > 0 ? sqrt(d / n) / count : 0;
+    }
+    return mean;
+}
+
+// States for errors: encoded tests; unsupervised: N(0, I), behind those that chose the cells.
+static double *neural_other_states(neural *v, const tss_model *m, int count) {
+    size_t r = (size_t)v->d->r, skip = (size_t)v->d->lipschitz.samples;
+    double *x = neural_spread(v, v->test, v->tests, count);
+    double *z = neural_z(v, m, x, v->d->unsupervised ? count + (int)skip : count);
+    if (v->d->unsupervised) memmove(z, z + skip * r, (size_t)count * r * sizeof *z);
+    free(x);
+    return z;
+}
+
+// error: relative, of ∇P, of ∇²P, of L_LS.
+static int neural_cubature_errors(neural *v, const tss_model *m, double error[3]) {
+    int r = v->d->r, count = NEURAL_SAMPLES;
+    size_t n = (size_t)count * (size_t)r;
+    double *z = neural_other_states(v, m, count), *g[2], *H[2], loss[2];
+    const tss_elements *e[2] = {v->cubature ? v->cubature : v->elements, v->elements};
+    tss_lipschitz_def d = neural_lipschitz(v);
+    tss_result ok = TSS_OK;
+    d.estimator = TSS_LIPSCHITZ_EXACT;
+    for (int k = 0; k < 2; k++) {
+        g[k] = (double *)need(n * (size_t)(r + 1), sizeof(double)), H[k] = g[k] + n;
+        if (ok == TSS_OK) ok = tss_reduced_potential(m->decoder, e[k], v->work, count, z, NULL, g[k], H[k]);
+        if (ok == TSS_OK) ok = tss_loss_lipschitz(m->decoder, e[k], v->work, &d, count, z, NULL, 1, &loss[k], NULL, NULL);
+    }
+    if (ok == TSS_OK) {
+        error[0] = neural_relative(count, r, g[0], g[1]), error[1] = neural_relative(count, r * r, H[0], H[1]);
+        error[2] = fabs(loss[0] - loss[1]) / loss[1];
+    }
+    free(z), free(g[0]), free(g[1]);
+    return ok == TSS_OK ? 1 : fail(v->r, "%s: measure: %s", v->r->o.scene, tss_result_text(ok));
+}
+
+static double neural_cpu(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// seconds[0..2]: vanilla; L_LS on all cells; L_LS on the cubature. Nothing is written.
+static int neural_step_costs(neural *v, double seconds[3]) {
+    neural_trainer t[3];
+    tss_elements *cubature = v->cubature;
+    int ok = 1;
+    memset(t, 0, sizeof t);
+    for (int k = 0; ok && k < 3; k++) {
+        v->cubature = k == 1 ? NULL : cubature;
+        seconds[k] = INFINITY;
+        ok = neural_trainer_open(v, k == 0 ? NEURAL_VANILLA : NEURAL_LIPSCHITZ, &t[k]);
+    }
+    for (int turn = 0; ok && turn < 3 * NEURAL_TURNS; turn++) {
+        int k = turn % 3;
+        tss_training_info i;
+        v->cubature = k == 1 ? NULL : cubature;
+        double began = neural_cpu();
+        tss_result e = t[k].t ? tss_training_step(t[k].t, &i) : neural_step(&t[k], &i);
+        seconds[k] = fmin(seconds[k], neural_cpu() - began);
+        if (e != TSS_OK) ok = fail(v->r, "%s: training: %s", v->r->o.scene, tss_result_text(e));
+    }
+    v->cubature = cubature;
+    for (int k = 0; k < 3; k++)
+        if (t[k].v) neural_trainer_close(&t[k]);
+    return ok;
+}
+
+static int neural_measure_row(neural *v, const neural_selection *s, const double error[3], const double seconds[3]) {
+    char path[700], name[120], machine[160];
+    snprintf(path, sizeof path, "%s/measure.csv", v->r->o.out);
+    int old = access(path, F_OK) == 0;
+    FILE *f = fopen(path, "a");
+    if (!f) return fail(v->r, "%s: cannot be written: %s", path, strerror(errno));
+    neural_machine(machine);
+    fprintf(f, "# %s, one thread, best of %d\n", machine, NEURAL_TURNS);
+    if (!old)
+        fputs("system,seed,dof,elements,r,wanted,cells,select_seconds,select_error,gradient_error,hessian_error,loss_error,"
+              "vanilla_ms,all_ms,cubature_ms,estimator,batch,lipschitz_batch\n", f);
+    fprintf(f, "%s,%d,%d,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%s,%d,%d\n", sweep_name(v->r, name), v->r->o.seed, v->n,
+            v->cells, v->d->r, v->d->lipschitz.cubature, s->cells, s->seconds, s->error, error[0], error[1], error[2], 1e3 * seconds[0], 1e3 * seconds[1],
+            1e3 * seconds[2], scene__estimators[v->d->lipschitz.estimator], v->d->train.batch, v->d->lipschitz.batch);
+    return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
+}
+
+static int neural_measure(neural *v) {
+    tss_model base;
+    neural_selection s;
+    double error[3] = {0, 0, 0}, seconds[3];
+    int there;
+    if (v->r->o.threads != 1) return fail(v->r, "tss neural measure: expected --threads 1 (it counts the CPU time of one)");
+    if (v->d->lipschitz.order != 2 || !(v->d->lipschitz.weight > 0))
+        return fail(v->r, "%s: neural.lipschitz: expected order 2 and a weight above 0 for measure", v->r->o.scene);
+    if (!neural_frames(v) || v->stopped) return !v->r->why.text[0];
+    if (!v->d->unsupervised && !neural_basis(v)) return 0;
+    if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
+    if (!there) return fail(v->r, "%s/base_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, v->r->o.seed, v->r->o.scene);
+    int ok = neural_cubature(v, &base, v->d->lipschitz.cubature, &v->cubature, &s) && neural_cubature_errors(v, &base, error);
+    tss_model_free(&base);
+    ok = ok && neural_step_costs(v, seconds) && neural_measure_row(v, &s, error, seconds);
+    if (ok)
+        printf("%d of %d cells, r %d: error of the gradient %.3g, Hessian %.3g, L_LS %.3g; a step %.3g ms, with L_LS %.3g, on the cubature %.3g\n",
+               s.cells, v->cells, v->d->r, error[0], error[1], error[2], 1e3 * seconds[0], 1e3 * seconds[1], 1e3 * seconds[2]);
     return ok;
 }
 
@@ -1362,7 +1499,8 @@ static int neural_run(neural *v) {
 static int command_neural(run *r) {
     static neural v;
     int ok = neural_open(r, &v);
-    if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v) : neural_evaluate(&v);
+    if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v)
+                  : strcmp(r->o.action, "measure") == 0 ? neural_measure(&v) : neural_evaluate(&v);
     neural_close(&v);
     return !ok ? 2 : v.stopped ? 3 : 0;
 }

@@ -123,7 +123,7 @@
                            of the spread of z, supervised (false), cubature: cells, 0: all (0), samples:
                            that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
-                           (10), max_line (128), max_iterations (1024)}
+                           (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0)}
     .samples               of Eq. 7 (256)
 
    IPC SCRIPTS  time density stiffness energy timeIntegration dampingStiff dampingRatio
@@ -257,7 +257,7 @@ typedef struct scene_neural {
         double rate, rate_end, weight;
     } lipschitz;
     struct {
-        int kind, memory, max_line, max_iterations;
+        int kind, memory, max_line, max_iterations, cubature;
         double eps, ftol;
     } solver;
 } scene_neural;
@@ -1834,6 +1834,7 @@ static const scene__key scene__reduced_keys[] = {
     SCENE__INT(scene_neural, solver.memory, "memory", 1, 64),
     SCENE__INT(scene_neural, solver.max_line, "max_line", 1, 1e6),
     SCENE__INT(scene_neural, solver.max_iterations, "max_iterations", 1, 1e9),
+    SCENE__INT(scene_neural, solver.cubature, "cubature", 0, 1e6),
     SCENE__END};
 
 static int scene__read_script_of(scene__reader *r, const cJSON *v, void *base) {

@@ -36,7 +36,7 @@ claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_b
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >>"$build/neural_c.log" 2>&1'
 # refused WORDS ARGUMENTS: exit 2 and these words
 refused() { words=$1; shift; tss "$@" >"$build/neural_bad.log" 2>&1; [ $? = 2 ] && grep -q -e "$words" "$build/neural_bad.log"; }
-claim "neural: refused: another action" 'refused "expected train, run or evaluate" walk "$out/a"'
+claim "neural: refused: another action" 'refused "expected train, run, evaluate or measure" walk "$out/a"'
 claim "neural: refused: a key" 'refused "neural.lipschitz.weigth: no such key; did you mean \"weight\"" train "$out/a" --set neural.lipschitz.weigth=1'
 claim "neural: refused: a value" 'refused "neural.r is 0, expected a whole number" train "$out/a" --set neural.r=0'
 claim "neural: refused: low above high" 'refused "low <= high" train "$out/a" --set "neural.script.handles.0.rotate=[[1,0,0],[0,0,0]]"'
