@@ -7,7 +7,8 @@
 
    The scene's section "neural" (scene.h) says what is learned of its first body, and what happens to
    it, at random: handles (nodes that are told where to be) and pulls (forces). Full space and
-   subspace have one energy, tss_neural_density.
+   subspace have one energy, tss_neural_density; a shell and the penalty of a ball come into full space
+   through the energy hook (neural_shell).
 
    train   1. supervised: sequences of frames in full space → DIR/frames.bin
            2. a linear basis of the frames (SVD in the mass norm) around both networks
@@ -43,6 +44,12 @@ typedef struct neural {
     double *X, *x0, *mass;     // n each: rest, start, kg
     int *cell;
     double lame[2];
+    int shell;            // the cells are triangles in space
+    tss_elements **one;   // shell: an object a cell, for full space
+    double *area;         // shell: of each node, m²
+    int *every;           // node i: i
+    tss_ball ball;        // where it is in the step at hand; radius 0: none
+    double ball_stiffness, ball_margin;
     unsigned char *held;  // of each coordinate: not free
     int handles, *handle;  // nodes of all handles
     tss_elements *elements, *cubature;
@@ -112,9 +119,10 @@ static void neural_take_body(neural *v) {
     const tss_mesh *m = &b->mesh;
     double lo[3], hi[3];
     v->dim = v->r->s.world.dim, v->nodes = m->nodes, v->n = v->nodes * v->dim;
-    v->cells = v->dim == 3 ? m->tets : m->triangles;
+    v->shell = b->shell > 0;
+    v->cells = v->dim == 3 && !v->shell ? m->tets : m->triangles;
     v->h = v->r->s.world.integrator == TSS_QUASISTATIC ? 0 : v->r->s.world.dt;
-    size_t n = (size_t)v->n, corners = (size_t)v->cells * (size_t)(v->dim + 1);
+    size_t n = (size_t)v->n, corners = (size_t)v->cells * (size_t)(v->dim + !v->shell);
     v->X = (double *)need(n, sizeof(double)), v->x0 = (double *)need(n, sizeof(double));
     v->mass = (double *)need(n, sizeof(double)), v->cell = (int *)need(corners, sizeof(int));
     v->before = (double *)need(n, sizeof(double)), v->held = (unsigned char *)need(n, 1), v->handle = (int *)need((size_t)v->nodes, sizeof(int));
@@ -123,7 +131,7 @@ static void neural_take_body(neural *v) {
         v->X[i] = rest[3 * (i / v->dim) + i % v->dim];
         v->x0[i] = m->x[3 * (i / v->dim) + i % v->dim];
     }
-    memcpy(v->cell, v->dim == 3 ? m->tet : m->triangle, corners * sizeof(int));
+    memcpy(v->cell, v->dim == 3 && !v->shell ? m->tet : m->triangle, corners * sizeof(int));
     scene__box_empty(lo, hi);
     scene__box(rest, m->nodes, lo, hi);
     for (int c = 0; c < 3; c++) v->size = fmax(v->size, hi[c] - lo[c]);
@@ -155,16 +163,195 @@ static tss_elements_def neural_elements(const neural *v) {
     const tss_material *m = &v->r->s.body[0].material;
     tss_elements_def d = tss_elements_def_default();
     d.dim = v->dim, d.nodes = v->nodes, d.X = v->X, d.cells = v->cells, d.cell = v->cell;
-    d.E = m->E, d.nu = m->nu;
+    d.E = m->E, d.nu = m->nu, d.shell = v->r->s.body[0].shell, d.bending = v->r->s.body[0].bending;
     return d;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_shell: tss.h has no membrane of this density, so that full space gets it through the energy
+// hook, a stencil a triangle, evaluated by the learner's own elements of that triangle; hinges are
+// tss_hinge_energy's (½ k there, k here); contact is the penalty of tss_reduced, a stencil a node.
+// ---------------------------------------------------------------------------------------------
+
+static tss_result neural_cell_lists(void *user, const tss_ctx *c, const double *x, const double *d, double t, tss_stencils *out) {
+    const neural *v = (const neural *)user;
+    (void)c, (void)x, (void)d, (void)t;
+    out->count = v->cells, out->node = v->cell, out->pattern = 1;
+    return TSS_OK;
+}
+
+static int neural_id(tss_ids ids, int k) { return ids.list ? ids.list[k] : ids.first + k; }
+
+static void neural_corners(const neural *v, int cell, const double *x, double y[9]) {
+    for (int i = 0; i < 9; i++) y[i] = x[3 * v->cell[3 * cell + i / 3] + i % 3];
+}
+
+static void neural_cell_value(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double y[9];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        neural_corners(v, neural_id(ids, k), x, y);
+        out[k] = tss_elements_potential(v->one[neural_id(ids, k)], y, NULL);
+    }
+}
+
+static void neural_cell_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double y[9];
+    (void)c;
+    memset(out, 0, 9 * (size_t)ids.count * sizeof *out);
+    for (int k = 0; k < ids.count; k++) {
+        neural_corners(v, neural_id(ids, k), x, y);
+        (void)tss_elements_potential(v->one[neural_id(ids, k)], y, out + 9 * k);
+    }
+}
+
+static void neural_jacobi(int m, double *a, double *e);
+
+// H (9 × 9) with its negative eigenvalues put to 0.
+static void neural_project_psd(double *H) {
+    double a[81], e[81];
+    memcpy(a, H, sizeof a);
+    neural_jacobi(9, a, e);
+    memset(H, 0, sizeof a);
+    for (int k = 0; k < 9; k++)
+        for (int i = 0; i < 81 && a[10 * k] > 0; i++) H[i] += a[10 * k] * e[9 * k + i / 9] * e[9 * k + i % 9];
+}
+
+// P2 = ½ Σ_a ∂_a²P along x1 = I, and its gradient in x1_a is H e_a.
+static void neural_cell_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd, double *out) {
+    const neural *v = (const neural *)user;
+    double y[9], I[81], half[81];
+    (void)c;
+    for (int i = 0; i < 81; i++) I[i] = i % 10 == 0, half[i] = 0.5 * I[i];
+    memset(out, 0, 81 * (size_t)ids.count * sizeof *out);
+    for (int k = 0; k < ids.count; k++) {
+        double zero[9] = {0}, P, P1[9], P2;
+        neural_corners(v, neural_id(ids, k), x, y);
+        (void)tss_elements_jets(v->one[neural_id(ids, k)], 9, y, I, half, zero, &P, P1, &P2, 0, NULL, 1, NULL, out + 81 * k, NULL);
+        if (psd) neural_project_psd(out + 81 * k);
+    }
+}
+
+static tss_result neural_ball_lists(void *user, const tss_ctx *c, const double *x, const double *d, double t, tss_stencils *out) {
+    const neural *v = (const neural *)user;
+    (void)c, (void)x, (void)d, (void)t;
+    out->count = v->nodes, out->node = v->every, out->pattern = 1;
+    return TSS_OK;
+}
+
+// How far node i is inside of the margin, <= 0, and the direction out.
+static double neural_inside(const neural *v, int i, const double *x, double n[3]) {
+    tss_ball ball = v->ball;
+    return fmin(0, tss_sdf_ball(&ball, x + 3 * i, n) - v->ball_margin);
+}
+
+static void neural_ball_value(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double n[3];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        double d = neural_inside(v, neural_id(ids, k), x, n);
+        out[k] = 0.5 * v->ball_stiffness * v->area[neural_id(ids, k)] * d * d;
+    }
+}
+
+static void neural_ball_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double n[3];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        double d = neural_inside(v, neural_id(ids, k), x, n);
+        for (int i = 0; i < 3; i++) out[3 * k + i] = v->ball_stiffness * v->area[neural_id(ids, k)] * d * n[i];
+    }
+}
+
+// With ∇²φ = (I − n nᵀ)/‖x − center‖ unless it is to be positive: d < 0.
+static void neural_ball_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd, double *out) {
+    const neural *v = (const neural *)user;
+    double n[3];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        double d = neural_inside(v, neural_id(ids, k), x, n), a = v->ball_stiffness * v->area[neural_id(ids, k)];
+        double bend = psd || d == 0 ? 0 : d / (d + v->ball_margin + v->ball.radius);
+        for (int i = 0; i < 9; i++)
+            out[9 * k + i] = d < 0 ? a * (n[i / 3] * n[i % 3] + bend * ((i % 4 == 0) - n[i / 3] * n[i % 3])) : 0;
+    }
+}
+
+// Each edge of two cells: (a, b), the third node of the cell that has a → b, and of the other. -1: two
+// cells go along an edge the same way.
+static int neural_hinges(const neural *v, int *hinge) {
+    int *next = (int *)need((size_t)(3 * v->cells), sizeof *next), *first = (int *)need((size_t)v->nodes, sizeof *first), n = 0;
+    for (int i = 0; i < v->nodes; i++) first[i] = -1;
+    for (int k = 0; k < 3 * v->cells && n >= 0; k++) {  // corner k starts the edge to the next corner
+        int t = k - k % 3, a = v->cell[k], b = v->cell[t + (k + 1) % 3];
+        for (int q = first[b]; q >= 0; q = next[q])
+            if (v->cell[q - q % 3 + (q + 1) % 3] == a) {
+                int h[4] = {b, a, v->cell[q - q % 3 + (q + 2) % 3], v->cell[t + (k + 2) % 3]};
+                memcpy(hinge + 4 * n++, h, sizeof h);
+            }
+        for (int q = first[a]; q >= 0; q = next[q])
+            if (v->cell[q - q % 3 + (q + 1) % 3] == b) n = -1;
+        next[k] = first[a], first[a] = k;
+    }
+    free(next), free(first);
+    return n;
+}
+
+static int neural_add(neural *v, tss_world *w, const tss_energy_def *d) {
+    return tss_energy_add(w, d, NULL) == TSS_OK ? 1 : fail(v->r, "%s: %s", v->r->o.scene, tss_world_error(w));
+}
+
+static int neural_add_bending(neural *v, tss_world *w) {
+    tss_hinge_def h = tss_hinge_def_default();
+    tss_energy_def d = tss_energy_def_default();
+    int *hinge = (int *)need((size_t)(12 * v->cells), sizeof *hinge);
+    h.hinges = neural_hinges(v, hinge), h.node = hinge, h.X = v->X, h.stiffness = 2 * v->r->s.body[0].bending;
+    int ok = h.hinges >= 0 || fail(v->r, "%s: bodies[0].shell: two triangles go along an edge the same way", v->r->o.scene);
+    tss_host host = tss_host_default();
+    host.log = print_log;
+    if (ok && h.hinges > 0 && tss_hinge_energy(&host, &h, &d) != TSS_OK) ok = fail(v->r, "%s: bodies[0].shell.bending is refused", v->r->o.scene);
+    ok = ok && (h.hinges == 0 || neural_add(v, w, &d));
+    free(hinge);
+    return ok;
+}
+
+static int neural_add_membranes(neural *v, tss_world *w) {
+    tss_energy_def d = tss_energy_def_default();
+    tss_elements_def ed = neural_elements(v);
+    static const int corner[3] = {0, 1, 2};
+    double y[9];
+    ed.nodes = 3, ed.X = y, ed.cells = 1, ed.cell = corner, ed.bending = 0;
+    v->one = (tss_elements **)need((size_t)v->cells, sizeof *v->one);
+    for (int k = 0; k < v->cells; k++) {
+        neural_corners(v, k, v->X, y);
+        if (tss_elements_create(NULL, &ed, &v->one[k]) != TSS_OK) return fail(v->r, "%s: triangle %d of the first body has no area", v->r->o.scene, k);
+    }
+    d.name = "membrane", d.arity = 3, d.flags = TSS_ENERGY_TIMES_AH2, d.user = v;
+    d.lists = neural_cell_lists, d.value = neural_cell_value, d.gradient = neural_cell_gradient, d.hessian = neural_cell_hessian;
+    return neural_add(v, w, &d);
+}
+
+// The world's masses are there.
+static int neural_shell(neural *v, tss_world *w) {
+    const scene_body *b = &v->r->s.body[0];
+    tss_energy_def d = tss_energy_def_default();
+    v->area = (double *)need((size_t)v->nodes, sizeof *v->area), v->every = (int *)need((size_t)v->nodes, sizeof *v->every);
+    for (int i = 0; i < v->nodes; i++) v->area[i] = v->mass[3 * i] / (b->material.rho * b->shell), v->every[i] = i;
+    if (!neural_add_membranes(v, w) || (b->bending > 0 && !neural_add_bending(v, w))) return 0;
+    d.name = "ball", d.arity = 1, d.flags = TSS_ENERGY_TIMES_AH2, d.user = v;
+    d.lists = neural_ball_lists, d.value = neural_ball_value, d.gradient = neural_ball_gradient, d.hessian = neural_ball_hessian;
+    return v->ball.radius == 0 || neural_add(v, w, &d);
 }
 
 // A world of the scene with the learner's energy.
 static int neural_world(neural *v, tss_world **w) {
     tss_material *m = &v->r->s.body[0].material;
     tss_ipc *ipc;
-    m->kind = TSS_CUSTOM_MATERIAL, m->density = tss_neural_density;
-    m->user = v->lame, m->has_C = 1, m->barrier = 0;
+    if (!v->shell) m->kind = TSS_CUSTOM_MATERIAL, m->density = tss_neural_density;
+    if (!v->shell) m->user = v->lame, m->has_C = 1, m->barrier = 0;
     return build_world(v->r, w, &ipc);
 }
 
@@ -179,6 +366,12 @@ static int neural_open(run *r, neural *v) {
     neural_take_body(v);
     if (!neural_take_handles(v) || !neural_world(v, &r->w)) return 0;
     for (int i = 0; i < v->n; i++) v->mass[i] = tss_world_masses(r->w)[i / v->dim];
+    v->ball.dim = 3, v->ball.radius = v->d->script.ball.radius;
+    v->ball_stiffness = v->d->script.ball.stiffness, v->ball_margin = v->d->script.ball.margin;
+    memcpy(v->ball.center, v->d->script.ball.center[0], sizeof v->ball.center);
+    if (v->ball.radius > 0 && !v->shell)
+        return fail(r, "%s: neural.script.ball: expected a first body with \"shell\"", r->o.scene);
+    if (v->shell && !neural_shell(v, r->w)) return 0;
     tss_elements_def d = neural_elements(v);
     tss_host host = tss_host_default();
     host.log = print_log, host.workers = r->o.threads;
@@ -192,6 +385,8 @@ static int neural_open(run *r, neural *v) {
 
 static void neural_close(neural *v) {
     free(v->X), free(v->x0), free(v->mass), free(v->cell), free(v->held), free(v->handle), free(v->before);
+    for (int k = 0; v->one && k < v->cells; k++) tss_elements_destroy(v->one[k]);
+    free(v->one), free(v->area), free(v->every);
     free(v->train), free(v->test), free(v->B), free(v->A), free(v->code), free(v->code_test);
     tss_elements_destroy(v->elements), tss_elements_destroy(v->cubature), tss_work_destroy(v->work);
 }
@@ -204,6 +399,7 @@ typedef struct neural_script {
     int length;
     double *pose;  // length × handles × 6: translation, rotation
     double *force;  // length × pulls × 3
+    double *center;  // length × 3: of the ball
 } neural_script;
 
 static int neural_hold(const neural *v, tss_rng *rng) {
@@ -211,12 +407,25 @@ static int neural_hold(const neural *v, tss_rng *rng) {
     return lo + (int)((hi - lo + 1) * tss_rng_uniform(rng));
 }
 
+static void neural_ball_path(const neural *v, tss_rng *rng, neural_script *s) {
+    double(*box)[3] = v->d->script.ball.center;
+    double from[3], to[3];
+    s->center = (double *)need(3 * (size_t)s->length, sizeof *s->center);
+    memcpy(from, box[0], sizeof from);
+    for (int at = 0; at < s->length && v->ball.radius > 0; memcpy(from, to, sizeof from)) {
+        int steps = neural_hold(v, rng);
+        for (int c = 0; c < 3; c++) to[c] = box[0][c] + (box[1][c] - box[0][c]) * tss_rng_uniform(rng);
+        for (int j = 1; j <= steps && at < s->length; j++, at++)
+            for (int c = 0; c < 3; c++) s->center[3 * at + c] = from[c] + (to[c] - from[c]) * j / steps;
+    }
+}
+
 // Handles walk from target to target on straight lines, all at once. Pulls come and go, each of its own.
 static neural_script neural_script_of(const neural *v, int sequence) {
     const scene_neural *d = v->d;
     int handles = d->script.handles, pulls = d->script.pulls, length = d->script.length;
     tss_rng rng = tss_rng_seed((uint64_t)d->script.seed * 1000003u + (uint64_t)sequence);
-    neural_script s = {length, NULL, NULL};
+    neural_script s = {length, NULL, NULL, NULL};
     s.pose = (double *)need((size_t)length * (size_t)handles * 6, sizeof(double));
     s.force = (double *)need((size_t)length * (size_t)pulls * 3, sizeof(double));
     double *from = (double *)need((size_t)handles * 12, sizeof(double)), *to = from + 6 * handles;
@@ -241,11 +450,12 @@ static neural_script neural_script_of(const neural *v, int sequence) {
             for (int j = 0; j < steps && at < length; j++, at++)
                 memcpy(s.force + 3 * (pulls * at + k), f, sizeof f);
         }
+    neural_ball_path(v, &rng, &s);
     free(from);
     return s;
 }
 
-static void neural_script_free(neural_script *s) { free(s->pose), free(s->force); }
+static void neural_script_free(neural_script *s) { free(s->pose), free(s->force), free(s->center); }
 
 // Where the handles' nodes are at step k: handles × dim, in the order of v->handle.
 static void neural_targets(const neural *v, const neural_script *s, int k, double *out) {
@@ -295,6 +505,7 @@ static int neural_even(const neural *v, const neural_script *s, int k) {
 static int neural_full_step(neural *v, const neural_script *s, int k, double *room, tss_step_info *info) {
     tss_result e = TSS_OK;
     const double *x = tss_world_positions(v->r->w);
+    memcpy(v->ball.center, s->center + 3 * k, sizeof v->ball.center);
     for (int i = 0; i < v->n; i++) {
         room[i] = 2 * x[i] - v->before[i];
         v->before[i] = x[i];
@@ -331,9 +542,14 @@ static uint64_t neural_signature(const neural *v) {
     h = neural_hash(neural_hash(neural_hash(h, v->X, n), v->x0, n), v->mass, n);
     h = neural_hash(neural_hash(h, v->lame, sizeof v->lame), &v->h, sizeof v->h);
     h = neural_hash(neural_hash(h, s->world.gravity, sizeof s->world.gravity), v->held, (size_t)v->n);
+    if (v->shell) {
+        const double thin[] = {s->body[0].shell, s->body[0].bending, v->ball.radius, v->ball_stiffness, v->ball_margin};
+        h = neural_hash(h, thin, sizeof thin);
+    }
     for (int k = 0; k < v->d->script.test; k += k ? k : 1) {  // the scripts themselves, of a few
         neural_script q = neural_script_of(v, k);
         h = neural_hash(h, q.pose, (size_t)q.length * (size_t)v->d->script.handles * 6 * sizeof(double));
+        if (v->shell) h = neural_hash(h, q.center, 3 * (size_t)q.length * sizeof(double));
         h = neural_hash(h, q.force, (size_t)q.length * (size_t)v->d->script.pulls * 3 * sizeof(double));
         neural_script_free(&q);
     }
@@ -992,6 +1208,10 @@ static int neural_entry_open(neural_trial *t, int which) {
     if (!neural_cubature(v, &e->m, d->solver.cubature, &e->cells, &chosen)) return 0;
     tss_reduced_def rd = tss_reduced_def_default();
     rd.decoder = e->m.decoder, rd.elements = e->cells ? e->cells : v->elements, rd.mass = v->mass, rd.h = v->h;
+    if (v->ball.radius > 0) {
+        rd.sdf = tss_sdf_ball, rd.sdf_user = &v->ball, rd.contact_stiffness = v->ball_stiffness;
+        rd.contact_margin = v->ball_margin, rd.contact_weight = v->area;
+    }
     rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
     rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
     tss_host host = tss_host_default();
@@ -1395,6 +1615,16 @@ static void neural_draw_state(run *r, const double *x, const float color[3]) {
     draw_body(r, 0);
 }
 
+static void neural_draw_ball(const neural *v) {
+    tss_mesh m;
+    view_style style = view_style_default();
+    if (v->ball.radius == 0 || tss_shape_ball_surface(NULL, v->ball.radius, 24, &m) != TSS_OK) return;
+    tss_mesh_translate(&m, v->ball.center[0], v->ball.center[1], v->ball.center[2]);
+    memcpy(style.colour, obstacle_color, sizeof style.colour);
+    view_add_mesh(v->r->view, m.x, m.nodes, m.triangle, m.triangles, &style);
+    tss_mesh_free(&m);
+}
+
 // The subspace's state in blue over full space in purple.
 static int neural_shoot(neural_trial *t, neural_album *a) {
     static const float blue[3] = {0.25f, 0.55f, 0.85f}, purple[3] = {0.62f, 0.40f, 0.72f};
@@ -1405,6 +1635,7 @@ static int neural_shoot(neural_trial *t, neural_album *a) {
         view_begin(r->view, &r->camera, &look);
         neural_draw_state(r, tss_world_positions(r->w), purple);
         neural_draw_state(r, tss_reduced_x(t->e[q].s), blue);
+        neural_draw_ball(t->v);
         view_image im = view_render(r->view);
         if (!im.rgb) return fail(r, "out of memory for a picture");
         a->label[a->shots] = neural_trial_names[q];
