@@ -167,21 +167,21 @@ cubature() {
     done
 }
 
-# (the base need not be good for its cost)
+# (the base need not be good for its cost; a tighter linear basis has as many modes as the largest r)
 cost() {
     for k in 4 8 16 24 32; do
         for e in u exact; do
             there neural_cost.csv system="$1" seed="$2" r=$k estimator=$e && continue
             train "$1" "$2" || return
-            variant "$1" "$2" "$1_cost$k" frames --set neural.r=$k --set neural.train.steps=300 --set neural.lipschitz.steps=1 &&
-                rows measure neural_cost.csv "$1" "$work/$1_cost$k" "$2" --set neural.r=$k --set neural.train.steps=300 \
+            variant "$1" "$2" "$1_cost$k" frames --set neural.r=$k --set neural.pca.tol=1e-6 --set neural.train.steps=300 --set neural.lipschitz.steps=1 &&
+                rows measure neural_cost.csv "$1" "$work/$1_cost$k" "$2" --set neural.r=$k --set neural.pca.tol=1e-6 --set neural.train.steps=300 \
                     --set neural.lipschitz.steps=1 --set neural.lipschitz.estimator=$e
         done
     done
 }
 
 r() {
-    for k in 4 6 10 16 24; do
+    for k in 4 6 8 10 12; do
         there neural_r.csv system="$1" seed="$2" r=$k && continue
         train "$1" "$2" || return
         variant "$1" "$2" "$1_r$k" frames --set neural.r=$k && rows evaluate neural_r.csv "$1" "$work/$1_r$k" "$2" --set neural.r=$k
