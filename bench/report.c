@@ -547,7 +547,10 @@ static int neural_first(const curves_table *t, int row, int key) {
 static double neural_number(const curves_table *t, int row, neural_column c) {
     double all = 0;
     for (int k = EXIT_CONVERGED; c.percent && k <= EXIT_ITERATIONS; k++) all += number(t, row, k);
-    return number(t, row, c.column) * (c.percent ? 100 / all : 1);
+    double v = number(t, row, c.column);
+    int lip = c.column == LIP || c.column == LIP_RELATIVE || c.column == LIP_0 || c.column == LIP_1;
+    if (lip && v == 0) return NAN;  // not asked of this method
+    return v * (c.percent ? 100 / all : 1);
 }
 
 // The mean over the rows alike; *runs (NULL allowed): how many.

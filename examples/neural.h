@@ -1263,17 +1263,26 @@ static void neural_distance(const neural_trial *t, const double *x, const double
     }
 }
 
+static double neural_cpu(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// With one thread the time that it ran: what else the machine does then counts little.
+static double neural_clock(const neural *v) { return v->r->o.threads == 1 ? neural_cpu() : now(NULL); }
+
 // Step k of a sequence by one subspace; `at`: of all test steps. Seconds include decoding.
 static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
     neural *v = t->v;
     tss_reduced_info i;
-    double began = now(NULL);
+    double began = neural_clock(v);
     tss_result r = tss_reduced_set_handles(e->s, v->handles, v->handle, t->target);
     tss_reduced_set_force(e->s, t->force);
     if (r == TSS_OK) r = tss_reduced_step(e->s, &i);
     if (r != TSS_OK) return fail(v->r, "%s: test step %d: %s", v->r->o.scene, at + 1, tss_result_text(r));
     const double *x = tss_reduced_x(e->s);
-    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began);
+    e->seconds[at] = fmin(e->seconds[at], neural_clock(v) - began);
     e->iterations[at] = i.iterations, e->evaluations[at] = i.evaluations, e->exit[at] = (int)i.exit;
     e->gradient[at] = i.gradient, e->energy[at] = i.energy;
     neural_distance(t, x, tss_world_positions(v->r->w), &e->mean[at], &e->farthest[at]);
@@ -1284,14 +1293,14 @@ static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
 static int neural_trial_full(neural_trial *t, const neural_script *s, int k, int at) {
     neural_entry *e = &t->e[NEURAL_TRIAL_FULL];
     tss_step_info i;
-    double began = now(NULL);
+    double began = neural_clock(t->v);
     e->iterations[at] = 0, e->exit[at] = TSS_EXIT_CONVERGED;
     for (int q = k - t->v->d->script.stride + 1; q <= k; q++) {
         if (!neural_full_step(t->v, s, q, t->room, &i)) return 0;
         e->iterations[at] += i.newton;
         if (i.status != TSS_STEP_CONVERGED) e->exit[at] = TSS_EXIT_ITERATIONS;
     }
-    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began), e->evaluations[at] = e->iterations[at];
+    e->seconds[at] = fmin(e->seconds[at], neural_clock(t->v) - began), e->evaluations[at] = e->iterations[at];
     e->energy[at] = tss_elements_potential(t->v->elements, tss_world_positions(t->v->r->w), NULL);
     return 1;
 }
@@ -1522,12 +1531,6 @@ static int neural_cubature_errors(neural *v, const tss_model *m, double error[3]
     }
     free(z), free(g[0]), free(g[1]);
     return ok == TSS_OK ? 1 : fail(v->r, "%s: measure: %s", v->r->o.scene, tss_result_text(ok));
-}
-
-static double neural_cpu(void) {
-    struct timespec t;
-    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
 // seconds[0..2]: vanilla; L_LS on all cells; L_LS on the cubature. Nothing is written.
