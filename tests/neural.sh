@@ -49,7 +49,7 @@ cloth() {
 claim "neural: cloth and a ball" 'cloth train && cloth evaluate && cloth run && [ -s "$out/d/states_0.png" ]'
 claim "neural: cloth: full space converges" '[ "$(awk -F, "\$2 == \"full\" {print \$10, \$13}" "$out/d/evaluate.csv")" = "15 0" ]'
 bad_cloth() { words=$1; shift; cloth train "$@"; [ $? = 2 ] && grep -q -e "$words" "$build/neural_d.log"; }
-claim "neural: refused: a shell of tets" 'bad_cloth "expected a soft surface of triangles" --set bodies.0.shape.kind=box'
+claim "neural: refused: a shell of tets" 'bad_cloth "expected a soft surface of triangles" --set bodies.0.shape.kind=box --set bodies.0.shape.upper=[1,1,1]'
 claim "neural: refused: a ball without a radius" 'bad_cloth "radius" --set neural.script.ball.radius=0'
 claim "neural: refused: a ball that meets no shell" 'refused "expected a first body with \"shell\"" train "$out/a" --set neural.script.ball.radius=1 --set neural.script.ball.stiffness=1'
 claim "neural: refused: another action" 'refused "expected train, run, evaluate or measure" walk "$out/a"'
