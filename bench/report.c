@@ -3,10 +3,10 @@
    report [-o OUT] RESULTS_DIR OUT_DIR
    report --text RESULTS_DIR            // the table of docs/error.md
 
-   Writes OUT/index.html (error against run time), OUT/stability.html and OUT/leave_out.html; OUT is
-   OUT_DIR unless given. RESULTS_DIR holds the committed large measurements (bench/results), OUT_DIR
+   Writes OUT/index.html (error against run time), OUT/stability.html, OUT/leave_out.html and
+   OUT/neural.html; OUT is OUT_DIR unless given. RESULTS_DIR holds the committed large measurements (bench/results), OUT_DIR
    the small rerun: error_vs_time.csv, error_steps.csv and SCENE_*.png in either; stability.csv,
-   stiffness.csv and leave_out.csv in OUT_DIR, or else in RESULTS_DIR. Of a file that is not there
+   stiffness.csv, leave_out.csv and neural*.csv in OUT_DIR, or else in RESULTS_DIR. Of a file that is not there
    the page says which command makes it. A file that is broken is named with its line, on the page
    and on stderr, and the exit code is 1; the other parts are written all the same.
 
@@ -511,6 +511,306 @@ static void page_leave_out(source *s, report *r) {
 }
 
 // ---------------------------------------------------------------------------------------------
+// >>neural: paper B's tables and figures from the files of bench/neural.sh. Seeds are averaged.
+// ---------------------------------------------------------------------------------------------
+
+enum { SYSTEM, METHOD, SEED, DOF, ELEMENTS, DIMENSION, STEP_MS, NEURAL_ITERATIONS, EVALUATIONS };
+enum { EXIT_CONVERGED = EVALUATIONS + 1, EXIT_SADDLE, EXIT_LINE, EXIT_ITERATIONS, GRADIENT, LIP };
+enum { PROJECTION = LIP + 1, SIMULATION, TRAIN_SECONDS, PROJECTION_MAX, SIMULATION_MAX, ENERGY };
+enum { Z_SCALE = ENERGY + 1, LIP_RELATIVE, WEIGHT, NEURAL_SOLVER, LIP_0, LIP_1, ORDER, EPS, CELLS };
+
+static const char *const neural_header =
+    "system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,"
+    "exit_line,exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,"
+    "projection_max,simulation_max,energy,z_scale,lip_relative,lipschitz_weight,solver,lip_0,lip_1,"
+    "order,eps,runtime_cells";
+static const char *const neural_command = "sh bench/neural.sh";
+
+typedef struct neural_column {
+    const char *head;
+    int column, percent;  // percent: of the four exits
+} neural_column;
+
+// Rows of the same system, method and key (a column; -1: none) as the row.
+static int neural_alike(const curves_table *t, int a, int b, int key) {
+    return !strcmp(curves_cell(t, a, SYSTEM), curves_cell(t, b, SYSTEM)) &&
+           !strcmp(curves_cell(t, a, METHOD), curves_cell(t, b, METHOD)) &&
+           (key < 0 || !strcmp(curves_cell(t, a, key), curves_cell(t, b, key)));
+}
+
+static int neural_first(const curves_table *t, int row, int key) {
+    for (int i = 0; i < row; i++)
+        if (neural_alike(t, i, row, key)) return 0;
+    return 1;
+}
+
+static double neural_number(const curves_table *t, int row, neural_column c) {
+    double all = 0;
+    for (int k = EXIT_CONVERGED; c.percent && k <= EXIT_ITERATIONS; k++) all += number(t, row, k);
+    double v = number(t, row, c.column);
+    int lip = c.column == LIP || c.column == LIP_RELATIVE || c.column == LIP_0 || c.column == LIP_1;
+    if (lip && v == 0) return NAN;  // not asked of this method
+    return v * (c.percent ? 100 / all : 1);
+}
+
+// The mean over the rows alike; *runs (NULL allowed): how many.
+static double neural_average(const curves_table *t, int row, int key, neural_column c, int *runs) {
+    double sum = 0;
+    int n = 0;
+    for (int i = 0; i < t->rows; i++)
+        if (neural_alike(t, i, row, key)) sum += neural_number(t, i, c), n++;
+    if (runs) *runs = n;
+    return sum / n;
+}
+
+// The row of the same system and key by a method; -1: none.
+static int neural_partner(const curves_table *t, int row, int key, const char *method) {
+    for (int i = 0; i < t->rows; i++)
+        if (!strcmp(curves_cell(t, i, SYSTEM), curves_cell(t, row, SYSTEM)) &&
+            !strcmp(curves_cell(t, i, METHOD), method) &&
+            (key < 0 || !strcmp(curves_cell(t, i, key), curves_cell(t, row, key))))
+            return i;
+    return -1;
+}
+
+// How many times faster than vanilla; NAN: there is none.
+static double neural_speed(const curves_table *t, int row, int key) {
+    static const neural_column ms = {"", STEP_MS, 0};
+    int vanilla = neural_partner(t, row, key, "vanilla");
+    if (vanilla < 0) return NAN;
+    return neural_average(t, vanilla, key, ms, NULL) / neural_average(t, row, key, ms, NULL);
+}
+
+static const char *neural_text(double v, char text[64]) {
+    if (v != v) return "\xe2\x80\x93";
+    if (v == 0 || (fabs(v) >= 1e-3 && fabs(v) < 1e5))
+        snprintf(text, 64, "%.4g", v);
+    else
+        snprintf(text, 64, "%.2e", v);
+    return text;
+}
+
+// A line a system, method and key: runs, speed against vanilla, and the columns' means. Methods that
+// the solver of a subspace does not concern are left out where there is a key.
+static void neural_means(report *r, const curves_table *t, int key, const char *key_head,
+                         const neural_column *column, int columns) {
+    enum { MOST = 20 };
+    const char *heads[MOST] = {"system", "method", key_head};
+    int n = key < 0 ? 2 : 3, width = n + 2 + columns, rows = 0;
+    heads[n] = "seeds", heads[n + 1] = "speed over vanilla";
+    for (int k = 0; k < columns; k++) heads[n + 2 + k] = column[k].head;
+    report_cell *cell = (report_cell *)calloc((size_t)(t->rows * width + 1), sizeof *cell);
+    char(*text)[64] = (char(*)[64])calloc((size_t)(t->rows * width + 1), sizeof *text);
+    for (int i = 0; cell && text && i < t->rows; i++) {
+        const char *method = curves_cell(t, i, METHOD);
+        int runs = 0, k = rows * width, subspace = !strcmp(method, "vanilla") || !strcmp(method, "lipschitz");
+        if (!neural_first(t, i, key) || (key >= 0 && !subspace)) continue;
+        cell[k].text = curves_cell(t, i, SYSTEM), cell[k + 1].text = method;
+        if (key >= 0) cell[k + 2].text = curves_cell(t, i, key);
+        for (int j = 0; j < columns; j++)
+            cell[k + n + 2 + j].text = neural_text(neural_average(t, i, key, column[j], &runs), text[k + n + 2 + j]);
+        snprintf(text[k + n], 64, "%d", runs);
+        double speed = neural_speed(t, i, key);
+        cell[k + n].text = text[k + n], cell[k + n + 1].text = neural_text(speed, text[k + n + 1]);
+        if (!strcmp(method, "lipschitz")) cell[k + n + 1].level = speed > 1 ? REPORT_GOOD : REPORT_WARN;
+        rows++;
+    }
+    if (cell && text) report_grid(r, NULL, heads, cell, width, rows);
+    free(cell), free(text);
+}
+
+// One file's table under a heading.
+static void neural_section(source *s, report *r, const char *heading, const char *words, const char *file, int key,
+                           const char *key_head, const neural_column *column, int columns) {
+    char path[700];
+    curves_table t;
+    report_heading(r, heading);
+    if (!open_table(s, r, file, neural_header, neural_command, &t, path)) return;
+    report_text(r, words);
+    if (*t.comment) report_code(r, t.comment);
+    neural_means(r, &t, key, key_head, column, columns);
+    curves_table_free(&t);
+}
+
+static void neural_tiles(report *r, const curves_table *t) {
+    for (int i = 0; i < t->rows; i++) {
+        char text[80];
+        double speed = neural_speed(t, i, -1);
+        if (strcmp(curves_cell(t, i, METHOD), "lipschitz") != 0 || !neural_first(t, i, -1) || speed != speed) continue;
+        snprintf(text, sizeof text, "%.2f times vanilla's speed", speed);
+        report_status(r, curves_cell(t, i, SYSTEM), text, speed > 1 ? REPORT_GOOD : REPORT_WARN);
+    }
+}
+
+static void neural_methods(source *s, report *r) {
+    static const neural_column c[] = {{"DOF", DOF, 0}, {"elements", ELEMENTS, 0}, {"r", DIMENSION, 0},
+        {"step, ms", STEP_MS, 0}, {"iterations", NEURAL_ITERATIONS, 0}, {"evaluations", EVALUATIONS, 0},
+        {"Lip (Eq. 7)", LIP, 0}, {"Lip relative to the spread of z", LIP_RELATIVE, 0},
+        {"projection error", PROJECTION, 0}, {"simulation error", SIMULATION, 0}, {"training, s", TRAIN_SECONDS, 0}};
+    char path[700];
+    curves_table t;
+    if (!open_table(s, r, "neural.csv", neural_header, neural_command, &t, path)) return;
+    neural_tiles(r, &t);
+    report_text(r,
+                "Table 1: a step in the subspace of a decoder trained without L_LS (vanilla), with it (lipschitz), in "
+                "the best linear subspace of the same r, and in full space. Errors are distances over the diagonal of "
+                "the rest shape, the mean of nodes and states: from the nearest state that the decoder reaches, and "
+                "from the full-space run beside it. Numbers are means over seeds.");
+    if (*t.comment) report_code(r, t.comment);
+    neural_means(r, &t, -1, NULL, c, (int)(sizeof c / sizeof *c));
+    curves_table_free(&t);
+}
+
+// >>neural_curves: lines over a column, one a measure; points of the same x are averaged
+
+typedef struct neural_line {
+    const char *name;
+    int column, filter;  // rows whose cell of column `filter` is `word`; -1: all
+    const char *word;
+} neural_line;
+
+static int neural_passes(const curves_table *t, int row, const char *system, const neural_line *l) {
+    return !strcmp(curves_cell(t, row, SYSTEM), system) &&
+           (l->filter < 0 || !strcmp(curves_cell(t, row, l->filter), l->word));
+}
+
+// Points by ascending x; returns how many.
+static int neural_points(const curves_table *t, const char *system, const neural_line *l, int over, double *x, double *y) {
+    int n = 0;
+    for (double last = -INFINITY;; n++) {
+        double next = INFINITY, sum = 0;
+        int count = 0;
+        for (int i = 0; i < t->rows; i++)
+            if (neural_passes(t, i, system, l) && number(t, i, over) > last) next = fmin(next, number(t, i, over));
+        if (!curves__finite(next)) return n;
+        for (int i = 0; i < t->rows; i++)
+            if (neural_passes(t, i, system, l) && number(t, i, over) == next) sum += number(t, i, l->column), count++;
+        x[n] = next, y[n] = sum / count, last = next;
+    }
+}
+
+static void neural_plot(report *r, const curves_table *t, const char *system, const char *title, int over,
+                        const char *x_unit, const char *y_unit, const neural_line *line, int lines) {
+    enum { MOST = 8 };
+    char text[160];
+    size_t rows = (size_t)t->rows + 1;
+    double *room = (double *)calloc(2 * MOST * rows, sizeof *room);
+    report_series s[MOST];
+    memset(s, 0, sizeof s);
+    for (int k = 0; room && k < lines; k++) {
+        double *x = room + 2 * (size_t)k * rows;
+        s[k].name = line[k].name, s[k].x = x, s[k].y = x + rows, s[k].colour = k + 1, s[k].style = REPORT_SOLID;
+        s[k].count = neural_points(t, system, &line[k], over, x, x + rows);
+    }
+    snprintf(text, sizeof text, "%.60s: %.80s", system, title);
+    report_plot p = report_plot_default(text, x_unit, y_unit);
+    p.log_y = p.markers = 1;
+    if (room) report_add_plot(r, &p, s, lines);
+    free(room);
+}
+
+static int neural_new_system(const curves_table *t, int row) {
+    for (int i = 0; i < row; i++)
+        if (!strcmp(curves_cell(t, i, SYSTEM), curves_cell(t, row, SYSTEM))) return 0;
+    return 1;
+}
+
+static void neural_dimension(source *s, report *r) {
+    static const neural_line lines[3][2] = {
+        {{"vanilla", PROJECTION, METHOD, "vanilla"}, {"lipschitz", PROJECTION, METHOD, "lipschitz"}},
+        {{"vanilla", STEP_MS, METHOD, "vanilla"}, {"lipschitz", STEP_MS, METHOD, "lipschitz"}},
+        {{"vanilla", LIP, METHOD, "vanilla"}, {"lipschitz", LIP, METHOD, "lipschitz"}}};
+    static const char *const title[3] = {"projection error", "time of a step", "Lip (Eq. 7)"};
+    static const char *const unit[3] = {"over the diagonal", "ms", "J"};
+    static const neural_column c[] = {{"step, ms", STEP_MS, 0}, {"evaluations", EVALUATIONS, 0},
+        {"projection error", PROJECTION, 0}, {"simulation error", SIMULATION, 0}, {"Lip", LIP, 0}};
+    char path[700];
+    curves_table t;
+    report_heading(r, "Dimension of the subspace (Fig. 11)");
+    if (!open_table(s, r, "neural_r.csv", neural_header, neural_command, &t, path)) return;
+    if (*t.comment) report_code(r, t.comment);
+    report_columns_begin(r);
+    for (int i = 0; i < t.rows; i++)
+        for (int k = 0; neural_new_system(&t, i) && k < 3; k++)
+            neural_plot(r, &t, curves_cell(&t, i, SYSTEM), title[k], DIMENSION, "r", unit[k], lines[k], 2);
+    report_columns_end(r);
+    neural_means(r, &t, DIMENSION, "r", c, (int)(sizeof c / sizeof *c));
+    curves_table_free(&t);
+}
+
+enum { M_SYSTEM, M_SEED, M_DOF, M_ELEMENTS, M_R, M_WANTED, M_CELLS, SELECT_SECONDS, SELECT_ERROR, GRADIENT_ERROR };
+enum { HESSIAN_ERROR = GRADIENT_ERROR + 1, LOSS_ERROR, VANILLA_MS, ALL_MS, CUBATURE_MS, ESTIMATOR };
+
+static const char *const measure_header =
+    "system,seed,dof,elements,r,wanted,cells,select_seconds,select_error,gradient_error,hessian_error,loss_error,"
+    "vanilla_ms,all_ms,cubature_ms,estimator,batch,lipschitz_batch";
+
+static report_level no_level(const curves_table *t, int row, int column) {
+    (void)t, (void)row, (void)column;
+    return REPORT_INFO;
+}
+
+static void neural_measures(source *s, report *r, const char *file, int cost) {
+    static const neural_line errors[] = {{"gradient", GRADIENT_ERROR, -1, NULL}, {"Hessian", HESSIAN_ERROR, -1, NULL},
+                                         {"L_LS", LOSS_ERROR, -1, NULL}};
+    static const neural_line seconds[] = {{"generation", SELECT_SECONDS, -1, NULL}};
+    static const neural_line steps[] = {{"vanilla", VANILLA_MS, -1, NULL},
+        {"L_LS, all cells", ALL_MS, ESTIMATOR, "u"}, {"L_LS, cubature", CUBATURE_MS, ESTIMATOR, "u"},
+        {"exact L_LS, all cells", ALL_MS, ESTIMATOR, "exact"}, {"exact L_LS, cubature", CUBATURE_MS, ESTIMATOR, "exact"}};
+    static const char *const heads[] = {"system", "seed", "DOF", "elements", "r", "cells, at most", "cells",
+        "generation, s", "error of the selection", "of the gradient", "of the Hessian", "of L_LS", "vanilla step, ms",
+        "with L_LS, all cells, ms", "cubature, ms", "estimator", "batch of L_C", "batch of L_LS"};
+    char path[700];
+    curves_table t;
+    if (!open_table(s, r, file, measure_header, neural_command, &t, path)) return;
+    if (*t.comment) report_code(r, t.comment);
+    report_columns_begin(r);
+    for (int i = 0; i < t.rows; i++) {
+        const char *system = curves_cell(&t, i, M_SYSTEM);
+        if (!neural_new_system(&t, i)) continue;
+        if (cost) {
+            neural_plot(r, &t, system, "a step of training", M_R, "r", "CPU ms", steps, 5);
+        } else {
+            neural_plot(r, &t, system, "relative errors", M_CELLS, "cells", "relative", errors, 3);
+            neural_plot(r, &t, system, "time to choose the cells", M_CELLS, "cells", "s", seconds, 1);
+        }
+    }
+    report_columns_end(r);
+    grid_of(r, &t, NULL, heads, no_level);
+    curves_table_free(&t);
+}
+
+static void page_neural(source *s, report *r) {
+    static const neural_column exits[] = {{"converged, %", EXIT_CONVERGED, 1}, {"saddle, %", EXIT_SADDLE, 1},
+        {"line search, %", EXIT_LINE, 1}, {"iterations, %", EXIT_ITERATIONS, 1}, {"mean exit gradient", GRADIENT, 0},
+        {"step, ms", STEP_MS, 0}};
+    static const neural_column orders[] = {{"\xce\xbb", WEIGHT, 0}, {"step, ms", STEP_MS, 0}, {"evaluations", EVALUATIONS, 0},
+        {"Lip of P", LIP_0, 0}, {"Lip of the gradient", LIP_1, 0}, {"Lip of the Hessian", LIP, 0},
+        {"spread of z", Z_SCALE, 0}, {"simulation error", SIMULATION, 0}};
+    static const neural_column newton[] = {{"step, ms", STEP_MS, 0}, {"iterations", NEURAL_ITERATIONS, 0},
+        {"evaluations", EVALUATIONS, 0}, {"simulation error", SIMULATION, 0}};
+    static const neural_column runtime[] = {{"step, ms", STEP_MS, 0}, {"evaluations", EVALUATIONS, 0},
+        {"simulation error", SIMULATION, 0}};
+    neural_methods(s, r);
+    neural_section(s, r, "Projected Newton (Table 4)", "The same decoders, each step by projected Newton.",
+                   "neural_newton.csv", -1, NULL, newton, 4);
+    neural_section(s, r, "When to stop (Table 2)",
+                   "How the steps of L-BFGS ended, over the bound eps on the largest component of the gradient.",
+                   "neural_eps.csv", EPS, "eps", exits, 6);
+    neural_section(s, r, "Order of the loss (Table 3)",
+                   "L_LS of Eq. 12. The weight of each order is such that it times Lip squared of that order, vanilla's, "
+                   "is the same.", "neural_order.csv", ORDER, "order", orders, 8);
+    neural_section(s, r, "Cubature at run time (Table 5)",
+                   "The solver's energy on all cells, or on cells chosen for each decoder.", "neural_runtime.csv", CELLS,
+                   "cells", runtime, 3);
+    report_heading(r, "Cells of the cubature (Fig. 10)");
+    neural_measures(s, r, "neural_cubature.csv", 0);
+    report_heading(r, "What a step of training costs (Fig. 3)");
+    neural_measures(s, r, "neural_cost.csv", 1);
+    neural_dimension(s, r);
+}
+
+// ---------------------------------------------------------------------------------------------
 // >>pages
 // ---------------------------------------------------------------------------------------------
 
@@ -521,6 +821,7 @@ static const struct {
     {"index.html", "Error against run time", page_index},
     {"stability.html", "Stability on stiff and extreme cases", page_stability},
     {"leave_out.html", "Leaving out what a scene does not need", page_leave_out},
+    {"neural.html", "Neural subspaces", page_neural},
 };
 
 enum { PAGES = sizeof pages / sizeof *pages };

@@ -3,10 +3,12 @@
    tss neural train    SCENE [-o DIR] [--seed N] [--minutes M] [--method vanilla|lipschitz] ...
    tss neural run      SCENE [-o DIR] [--seed N] ...
    tss neural evaluate SCENE [-o DIR] [--seed N] ...
+   tss neural measure  SCENE [-o DIR] [--seed N] ...
 
    The scene's section "neural" (scene.h) says what is learned of its first body, and what happens to
    it, at random: handles (nodes that are told where to be) and pulls (forces). Full space and
-   subspace have one energy, tss_neural_density.
+   subspace have one energy, tss_neural_density; a shell and the penalty of a ball come into full space
+   through the energy hook (neural_shell).
 
    train   1. supervised: sequences of frames in full space → DIR/frames.bin
            2. a linear basis of the frames (SVD in the mass norm) around both networks
@@ -20,6 +22,9 @@
    run     the test sequences in full space and in each subspace: steps_N.csv, pictures, report.html
    evaluate the same, and Eq. 7 and projections of the test's states: a row a method is appended to
            DIR/evaluate.csv
+
+   measure what the cubature misses on the base, and what a training step costs: a row to
+           DIR/measure.csv
 
    Eq. 3 costs only as much as the networks: x = x0 + B c with BᵀMB = s² I, so that ‖Δx‖²_M is s²‖Δc‖²
    but for what B does not reach, which no θ alters. Training sees c. s² is the mean of ‖x − x0‖²_M,
@@ -39,6 +44,12 @@ typedef struct neural {
     double *X, *x0, *mass;     // n each: rest, start, kg
     int *cell;
     double lame[2];
+    int shell;            // the cells are triangles in space
+    tss_elements **one;   // shell: an object a cell, for full space
+    double *area;         // shell: of each node, m²
+    int *every;           // node i: i
+    tss_ball ball;        // where it is in the step at hand; radius 0: none
+    double ball_stiffness, ball_margin;
     unsigned char *held;  // of each coordinate: not free
     int handles, *handle;  // nodes of all handles
     int pinned, *pin;      // their coordinates if L_LS and Eq. 7 see them where frames have them, else 0
@@ -109,9 +120,10 @@ static void neural_take_body(neural *v) {
     const tss_mesh *m = &b->mesh;
     double lo[3], hi[3];
     v->dim = v->r->s.world.dim, v->nodes = m->nodes, v->n = v->nodes * v->dim;
-    v->cells = v->dim == 3 ? m->tets : m->triangles;
+    v->shell = b->shell > 0;
+    v->cells = v->dim == 3 && !v->shell ? m->tets : m->triangles;
     v->h = v->r->s.world.integrator == TSS_QUASISTATIC ? 0 : v->r->s.world.dt;
-    size_t n = (size_t)v->n, corners = (size_t)v->cells * (size_t)(v->dim + 1);
+    size_t n = (size_t)v->n, corners = (size_t)v->cells * (size_t)(v->dim + !v->shell);
     v->X = (double *)need(n, sizeof(double)), v->x0 = (double *)need(n, sizeof(double));
     v->mass = (double *)need(n, sizeof(double)), v->cell = (int *)need(corners, sizeof(int));
     v->before = (double *)need(n, sizeof(double)), v->held = (unsigned char *)need(n, 1), v->handle = (int *)need((size_t)v->nodes, sizeof(int));
@@ -120,7 +132,7 @@ static void neural_take_body(neural *v) {
         v->X[i] = rest[3 * (i / v->dim) + i % v->dim];
         v->x0[i] = m->x[3 * (i / v->dim) + i % v->dim];
     }
-    memcpy(v->cell, v->dim == 3 ? m->tet : m->triangle, corners * sizeof(int));
+    memcpy(v->cell, v->dim == 3 && !v->shell ? m->tet : m->triangle, corners * sizeof(int));
     scene__box_empty(lo, hi);
     scene__box(rest, m->nodes, lo, hi);
     for (int c = 0; c < 3; c++) v->size = fmax(v->size, hi[c] - lo[c]);
@@ -152,16 +164,195 @@ static tss_elements_def neural_elements(const neural *v) {
     const tss_material *m = &v->r->s.body[0].material;
     tss_elements_def d = tss_elements_def_default();
     d.dim = v->dim, d.nodes = v->nodes, d.X = v->X, d.cells = v->cells, d.cell = v->cell;
-    d.E = m->E, d.nu = m->nu;
+    d.E = m->E, d.nu = m->nu, d.shell = v->r->s.body[0].shell, d.bending = v->r->s.body[0].bending;
     return d;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_shell: tss.h has no membrane of this density, so that full space gets it through the energy
+// hook, a stencil a triangle, evaluated by the learner's own elements of that triangle; hinges are
+// tss_hinge_energy's (½ k there, k here); contact is the penalty of tss_reduced, a stencil a node.
+// ---------------------------------------------------------------------------------------------
+
+static tss_result neural_cell_lists(void *user, const tss_ctx *c, const double *x, const double *d, double t, tss_stencils *out) {
+    const neural *v = (const neural *)user;
+    (void)c, (void)x, (void)d, (void)t;
+    out->count = v->cells, out->node = v->cell, out->pattern = 1;
+    return TSS_OK;
+}
+
+static int neural_id(tss_ids ids, int k) { return ids.list ? ids.list[k] : ids.first + k; }
+
+static void neural_corners(const neural *v, int cell, const double *x, double y[9]) {
+    for (int i = 0; i < 9; i++) y[i] = x[3 * v->cell[3 * cell + i / 3] + i % 3];
+}
+
+static void neural_cell_value(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double y[9];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        neural_corners(v, neural_id(ids, k), x, y);
+        out[k] = tss_elements_potential(v->one[neural_id(ids, k)], y, NULL);
+    }
+}
+
+static void neural_cell_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double y[9];
+    (void)c;
+    memset(out, 0, 9 * (size_t)ids.count * sizeof *out);
+    for (int k = 0; k < ids.count; k++) {
+        neural_corners(v, neural_id(ids, k), x, y);
+        (void)tss_elements_potential(v->one[neural_id(ids, k)], y, out + 9 * k);
+    }
+}
+
+static void neural_jacobi(int m, double *a, double *e);
+
+// H (9 × 9) with its negative eigenvalues put to 0.
+static void neural_project_psd(double *H) {
+    double a[81], e[81];
+    memcpy(a, H, sizeof a);
+    neural_jacobi(9, a, e);
+    memset(H, 0, sizeof a);
+    for (int k = 0; k < 9; k++)
+        for (int i = 0; i < 81 && a[10 * k] > 0; i++) H[i] += a[10 * k] * e[9 * k + i / 9] * e[9 * k + i % 9];
+}
+
+// P2 = ½ Σ_a ∂_a²P along x1 = I, and its gradient in x1_a is H e_a.
+static void neural_cell_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd, double *out) {
+    const neural *v = (const neural *)user;
+    double y[9], I[81], half[81];
+    (void)c;
+    for (int i = 0; i < 81; i++) I[i] = i % 10 == 0, half[i] = 0.5 * I[i];
+    memset(out, 0, 81 * (size_t)ids.count * sizeof *out);
+    for (int k = 0; k < ids.count; k++) {
+        double zero[9] = {0}, P, P1[9], P2;
+        neural_corners(v, neural_id(ids, k), x, y);
+        (void)tss_elements_jets(v->one[neural_id(ids, k)], 9, y, I, half, zero, &P, P1, &P2, 0, NULL, 1, NULL, out + 81 * k, NULL);
+        if (psd) neural_project_psd(out + 81 * k);
+    }
+}
+
+static tss_result neural_ball_lists(void *user, const tss_ctx *c, const double *x, const double *d, double t, tss_stencils *out) {
+    const neural *v = (const neural *)user;
+    (void)c, (void)x, (void)d, (void)t;
+    out->count = v->nodes, out->node = v->every, out->pattern = 1;
+    return TSS_OK;
+}
+
+// How far node i is inside of the margin, <= 0, and the direction out.
+static double neural_inside(const neural *v, int i, const double *x, double n[3]) {
+    tss_ball ball = v->ball;
+    return fmin(0, tss_sdf_ball(&ball, x + 3 * i, n) - v->ball_margin);
+}
+
+static void neural_ball_value(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double n[3];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        double d = neural_inside(v, neural_id(ids, k), x, n);
+        out[k] = 0.5 * v->ball_stiffness * v->area[neural_id(ids, k)] * d * d;
+    }
+}
+
+static void neural_ball_gradient(void *user, const tss_ctx *c, const double *x, tss_ids ids, double *out) {
+    const neural *v = (const neural *)user;
+    double n[3];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        double d = neural_inside(v, neural_id(ids, k), x, n);
+        for (int i = 0; i < 3; i++) out[3 * k + i] = v->ball_stiffness * v->area[neural_id(ids, k)] * d * n[i];
+    }
+}
+
+// With ∇²φ = (I − n nᵀ)/‖x − center‖ unless it is to be positive: d < 0.
+static void neural_ball_hessian(void *user, const tss_ctx *c, const double *x, tss_ids ids, int psd, double *out) {
+    const neural *v = (const neural *)user;
+    double n[3];
+    (void)c;
+    for (int k = 0; k < ids.count; k++) {
+        double d = neural_inside(v, neural_id(ids, k), x, n), a = v->ball_stiffness * v->area[neural_id(ids, k)];
+        double bend = psd || d == 0 ? 0 : d / (d + v->ball_margin + v->ball.radius);
+        for (int i = 0; i < 9; i++)
+            out[9 * k + i] = d < 0 ? a * (n[i / 3] * n[i % 3] + bend * ((i % 4 == 0) - n[i / 3] * n[i % 3])) : 0;
+    }
+}
+
+// Each edge of two cells: (a, b), the third node of the cell that has a → b, and of the other. -1: two
+// cells go along an edge the same way.
+static int neural_hinges(const neural *v, int *hinge) {
+    int *next = (int *)need((size_t)(3 * v->cells), sizeof *next), *first = (int *)need((size_t)v->nodes, sizeof *first), n = 0;
+    for (int i = 0; i < v->nodes; i++) first[i] = -1;
+    for (int k = 0; k < 3 * v->cells && n >= 0; k++) {  // corner k starts the edge to the next corner
+        int t = k - k % 3, a = v->cell[k], b = v->cell[t + (k + 1) % 3];
+        for (int q = first[b]; q >= 0; q = next[q])
+            if (v->cell[q - q % 3 + (q + 1) % 3] == a) {
+                int h[4] = {b, a, v->cell[q - q % 3 + (q + 2) % 3], v->cell[t + (k + 2) % 3]};
+                memcpy(hinge + 4 * n++, h, sizeof h);
+            }
+        for (int q = first[a]; q >= 0; q = next[q])
+            if (v->cell[q - q % 3 + (q + 1) % 3] == b) n = -1;
+        next[k] = first[a], first[a] = k;
+    }
+    free(next), free(first);
+    return n;
+}
+
+static int neural_add(neural *v, tss_world *w, const tss_energy_def *d) {
+    return tss_energy_add(w, d, NULL) == TSS_OK ? 1 : fail(v->r, "%s: %s", v->r->o.scene, tss_world_error(w));
+}
+
+static int neural_add_bending(neural *v, tss_world *w) {
+    tss_hinge_def h = tss_hinge_def_default();
+    tss_energy_def d = tss_energy_def_default();
+    int *hinge = (int *)need((size_t)(12 * v->cells), sizeof *hinge);
+    h.hinges = neural_hinges(v, hinge), h.node = hinge, h.X = v->X, h.stiffness = 2 * v->r->s.body[0].bending;
+    int ok = h.hinges >= 0 || fail(v->r, "%s: bodies[0].shell: two triangles go along an edge the same way", v->r->o.scene);
+    tss_host host = tss_host_default();
+    host.log = print_log;
+    if (ok && h.hinges > 0 && tss_hinge_energy(&host, &h, &d) != TSS_OK) ok = fail(v->r, "%s: bodies[0].shell.bending is refused", v->r->o.scene);
+    ok = ok && (h.hinges == 0 || neural_add(v, w, &d));
+    free(hinge);
+    return ok;
+}
+
+static int neural_add_membranes(neural *v, tss_world *w) {
+    tss_energy_def d = tss_energy_def_default();
+    tss_elements_def ed = neural_elements(v);
+    static const int corner[3] = {0, 1, 2};
+    double y[9];
+    ed.nodes = 3, ed.X = y, ed.cells = 1, ed.cell = corner, ed.bending = 0;
+    v->one = (tss_elements **)need((size_t)v->cells, sizeof *v->one);
+    for (int k = 0; k < v->cells; k++) {
+        neural_corners(v, k, v->X, y);
+        if (tss_elements_create(NULL, &ed, &v->one[k]) != TSS_OK) return fail(v->r, "%s: triangle %d of the first body has no area", v->r->o.scene, k);
+    }
+    d.name = "membrane", d.arity = 3, d.flags = TSS_ENERGY_TIMES_AH2, d.user = v;
+    d.lists = neural_cell_lists, d.value = neural_cell_value, d.gradient = neural_cell_gradient, d.hessian = neural_cell_hessian;
+    return neural_add(v, w, &d);
+}
+
+// The world's masses are there.
+static int neural_shell(neural *v, tss_world *w) {
+    const scene_body *b = &v->r->s.body[0];
+    tss_energy_def d = tss_energy_def_default();
+    v->area = (double *)need((size_t)v->nodes, sizeof *v->area), v->every = (int *)need((size_t)v->nodes, sizeof *v->every);
+    for (int i = 0; i < v->nodes; i++) v->area[i] = v->mass[3 * i] / (b->material.rho * b->shell), v->every[i] = i;
+    if (!neural_add_membranes(v, w) || (b->bending > 0 && !neural_add_bending(v, w))) return 0;
+    d.name = "ball", d.arity = 1, d.flags = TSS_ENERGY_TIMES_AH2, d.user = v;
+    d.lists = neural_ball_lists, d.value = neural_ball_value, d.gradient = neural_ball_gradient, d.hessian = neural_ball_hessian;
+    return v->ball.radius == 0 || neural_add(v, w, &d);
 }
 
 // A world of the scene with the learner's energy.
 static int neural_world(neural *v, tss_world **w) {
     tss_material *m = &v->r->s.body[0].material;
     tss_ipc *ipc;
-    m->kind = TSS_CUSTOM_MATERIAL, m->density = tss_neural_density;
-    m->user = v->lame, m->has_C = 1, m->barrier = 0;
+    if (!v->shell) m->kind = TSS_CUSTOM_MATERIAL, m->density = tss_neural_density;
+    if (!v->shell) m->user = v->lame, m->has_C = 1, m->barrier = 0;
     return build_world(v->r, w, &ipc);
 }
 
@@ -179,6 +370,12 @@ static int neural_open(run *r, neural *v) {
     v->pinned = v->d->unsupervised || !v->d->lipschitz.handles ? 0 : v->dim * v->handles;
     v->pin = (int *)need((size_t)(v->dim * v->handles), sizeof(int));
     for (int i = 0; i < v->dim * v->handles; i++) v->pin[i] = v->dim * v->handle[i / v->dim] + i % v->dim;
+    v->ball.dim = 3, v->ball.radius = v->d->script.ball.radius;
+    v->ball_stiffness = v->d->script.ball.stiffness, v->ball_margin = v->d->script.ball.margin;
+    memcpy(v->ball.center, v->d->script.ball.center[0], sizeof v->ball.center);
+    if (v->ball.radius > 0 && !v->shell)
+        return fail(r, "%s: neural.script.ball: expected a first body with \"shell\"", r->o.scene);
+    if (v->shell && !neural_shell(v, r->w)) return 0;
     tss_elements_def d = neural_elements(v);
     tss_host host = tss_host_default();
     host.log = print_log, host.workers = r->o.threads;
@@ -195,6 +392,8 @@ static int neural_open(run *r, neural *v) {
 
 static void neural_close(neural *v) {
     free(v->X), free(v->x0), free(v->mass), free(v->cell), free(v->held), free(v->handle), free(v->pin), free(v->before);
+    for (int k = 0; v->one && k < v->cells; k++) tss_elements_destroy(v->one[k]);
+    free(v->one), free(v->area), free(v->every);
     free(v->train), free(v->test), free(v->B), free(v->A), free(v->code), free(v->code_test);
     tss_elements_destroy(v->elements), tss_elements_destroy(v->cubature), tss_work_destroy(v->work);
 }
@@ -207,6 +406,7 @@ typedef struct neural_script {
     int length;
     double *pose;  // length × handles × 6: translation, rotation
     double *force;  // length × pulls × 3
+    double *center;  // length × 3: of the ball
 } neural_script;
 
 static int neural_hold(const neural *v, tss_rng *rng) {
@@ -214,12 +414,25 @@ static int neural_hold(const neural *v, tss_rng *rng) {
     return lo + (int)((hi - lo + 1) * tss_rng_uniform(rng));
 }
 
+static void neural_ball_path(const neural *v, tss_rng *rng, neural_script *s) {
+    double(*box)[3] = v->d->script.ball.center;
+    double from[3], to[3];
+    s->center = (double *)need(3 * (size_t)s->length, sizeof *s->center);
+    memcpy(from, box[0], sizeof from);
+    for (int at = 0; at < s->length && v->ball.radius > 0; memcpy(from, to, sizeof from)) {
+        int steps = neural_hold(v, rng);
+        for (int c = 0; c < 3; c++) to[c] = box[0][c] + (box[1][c] - box[0][c]) * tss_rng_uniform(rng);
+        for (int j = 1; j <= steps && at < s->length; j++, at++)
+            for (int c = 0; c < 3; c++) s->center[3 * at + c] = from[c] + (to[c] - from[c]) * j / steps;
+    }
+}
+
 // Handles walk from target to target on straight lines, all at once. Pulls come and go, each of its own.
 static neural_script neural_script_of(const neural *v, int sequence) {
     const scene_neural *d = v->d;
     int handles = d->script.handles, pulls = d->script.pulls, length = d->script.length;
     tss_rng rng = tss_rng_seed((uint64_t)d->script.seed * 1000003u + (uint64_t)sequence);
-    neural_script s = {length, NULL, NULL};
+    neural_script s = {length, NULL, NULL, NULL};
     s.pose = (double *)need((size_t)length * (size_t)handles * 6, sizeof(double));
     s.force = (double *)need((size_t)length * (size_t)pulls * 3, sizeof(double));
     double *from = (double *)need((size_t)handles * 12, sizeof(double)), *to = from + 6 * handles;
@@ -244,11 +457,12 @@ static neural_script neural_script_of(const neural *v, int sequence) {
             for (int j = 0; j < steps && at < length; j++, at++)
                 memcpy(s.force + 3 * (pulls * at + k), f, sizeof f);
         }
+    neural_ball_path(v, &rng, &s);
     free(from);
     return s;
 }
 
-static void neural_script_free(neural_script *s) { free(s->pose), free(s->force); }
+static void neural_script_free(neural_script *s) { free(s->pose), free(s->force), free(s->center); }
 
 // Where the handles' nodes are at step k: handles × dim, in the order of v->handle.
 static void neural_targets(const neural *v, const neural_script *s, int k, double *out) {
@@ -298,6 +512,7 @@ static int neural_even(const neural *v, const neural_script *s, int k) {
 static int neural_full_step(neural *v, const neural_script *s, int k, double *room, tss_step_info *info) {
     tss_result e = TSS_OK;
     const double *x = tss_world_positions(v->r->w);
+    memcpy(v->ball.center, s->center + 3 * k, sizeof v->ball.center);
     for (int i = 0; i < v->n; i++) {
         room[i] = 2 * x[i] - v->before[i];
         v->before[i] = x[i];
@@ -334,9 +549,14 @@ static uint64_t neural_signature(const neural *v) {
     h = neural_hash(neural_hash(neural_hash(h, v->X, n), v->x0, n), v->mass, n);
     h = neural_hash(neural_hash(h, v->lame, sizeof v->lame), &v->h, sizeof v->h);
     h = neural_hash(neural_hash(h, s->world.gravity, sizeof s->world.gravity), v->held, (size_t)v->n);
+    if (v->shell) {
+        const double thin[] = {s->body[0].shell, s->body[0].bending, v->ball.radius, v->ball_stiffness, v->ball_margin};
+        h = neural_hash(h, thin, sizeof thin);
+    }
     for (int k = 0; k < v->d->script.test; k += k ? k : 1) {  // the scripts themselves, of a few
         neural_script q = neural_script_of(v, k);
         h = neural_hash(h, q.pose, (size_t)q.length * (size_t)v->d->script.handles * 6 * sizeof(double));
+        if (v->shell) h = neural_hash(h, q.center, 3 * (size_t)q.length * sizeof(double));
         h = neural_hash(h, q.force, (size_t)q.length * (size_t)v->d->script.pulls * 3 * sizeof(double));
         neural_script_free(&q);
     }
@@ -653,36 +873,45 @@ static void neural_pinned(const neural *v, const double *x, int count, double *v
         value[i] = x[(size_t)v->n * (size_t)(i / v->pinned) + (size_t)v->pin[i % v->pinned]];
 }
 
-static tss_result neural_eq7(neural *v, const tss_model *m, const tss_elements *e, int pinned, int count, const double *x, const double *z, double *lip) {
+// Eq. 7, of order o; pinned: with the handles where the frames have them.
+static tss_result neural_eq7(neural *v, const tss_model *m, const tss_elements *e, int pinned, int o, int count, const double *x, const double *z,
+                             double *lip) {
     double *value = (double *)need((size_t)count * (size_t)v->pinned, sizeof *value);
     tss_held held = {v->pinned, v->pin, value};
     if (pinned) neural_pinned(v, x, count, value);
-    tss_result r = tss_lipschitz_estimate_held(m->decoder, e, v->work, 2, pinned && v->pinned ? &held : NULL, count, z, lip);
+    tss_result r = tss_lipschitz_estimate_held(m->decoder, e, v->work, o, pinned && v->pinned ? &held : NULL, count, z, lip);
     free(value);
     return r;
 }
 
-static int neural_cubature(neural *v, const tss_model *base, double *seconds) {
+typedef struct neural_selection {
+    int cells;             // chosen
+    double error, seconds; // relative, of the samples' gradients
+} neural_selection;
+
+// At most `most` cells that stand for all of them in the subspace of a model; 0 or all: *out stays.
+static int neural_cubature(neural *v, const tss_model *base, int most, tss_elements **out, neural_selection *s) {
     const scene_neural *d = v->d;
-    double began = now(NULL), error;
-    int count, ok;
-    if (d->lipschitz.cubature == 0 || d->lipschitz.cubature >= v->cells) return 1;
+    double began = now(NULL);
+    int ok;
+    s->cells = v->cells, s->error = s->seconds = 0;
+    if (most == 0 || most >= v->cells) return 1;
     double *x = neural_spread(v, v->train, v->trains, d->lipschitz.samples);
     double *z = neural_z(v, base, x, d->lipschitz.samples);
-    int *subset = (int *)need((size_t)d->lipschitz.cubature, sizeof *subset);
-    double *weight = (double *)need((size_t)d->lipschitz.cubature, sizeof *weight);
+    int *subset = (int *)need((size_t)most, sizeof *subset);
+    double *weight = (double *)need((size_t)most, sizeof *weight);
     tss_cubature_def c = tss_cubature_def_default();
     double *value = (double *)need((size_t)d->lipschitz.samples * (size_t)v->pinned, sizeof *value);
     tss_held held = {v->pinned, v->pin, value};
     neural_pinned(v, x, d->lipschitz.samples, value);
-    c.count = d->lipschitz.cubature, c.seed = (uint64_t)v->r->o.seed, c.held = v->pinned ? &held : NULL;
-    tss_result e = tss_cubature_select(base->decoder, v->elements, v->work, &c, d->lipschitz.samples, z, subset, weight, &count, &error);
+    c.count = most, c.seed = (uint64_t)v->r->o.seed, c.held = v->pinned ? &held : NULL;
+    tss_result e = tss_cubature_select(base->decoder, v->elements, v->work, &c, d->lipschitz.samples, z, subset, weight, &s->cells, &s->error);
     tss_elements_def ed = neural_elements(v);
-    ed.count = count, ed.subset = subset, ed.weight = weight;
-    if (e == TSS_OK) e = tss_elements_create(NULL, &ed, &v->cubature);
-    ok = e == TSS_OK ? 1 : fail(v->r, "%s: neural.lipschitz.cubature: %s", v->r->o.scene, tss_result_text(e));
-    *seconds = now(NULL) - began;
-    if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", count, v->cells, error, *seconds);
+    ed.count = s->cells, ed.subset = subset, ed.weight = weight;
+    s->seconds = now(NULL) - began;
+    if (e == TSS_OK) e = tss_elements_create(NULL, &ed, out);
+    ok = e == TSS_OK ? 1 : fail(v->r, "%s: cubature: %s", v->r->o.scene, tss_result_text(e));
+    if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", s->cells, v->cells, s->error, s->seconds);
     free(x), free(z), free(subset), free(weight), free(value);
     return ok;
 }
@@ -907,7 +1136,7 @@ static int neural_checkpoint(neural_trainer *t) {
     char path[700];
     double *z = neural_z(v, &t->m, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     const tss_elements *e = v->cubature ? v->cubature : v->elements;
-    (void)neural_eq7(v, &t->m, e, 1, NEURAL_SAMPLES, t->z_test, z, &t->lip);
+    (void)neural_eq7(v, &t->m, e, 1, 2, NEURAL_SAMPLES, t->z_test, z, &t->lip);
     fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
             t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped);
     fflush(t->rows), free(z), free(mean);
@@ -953,14 +1182,14 @@ static int neural_train_phase(neural *v, neural_phase phase) {
 
 static int neural_train(neural *v) {
     const char *only = v->r->o.method;
-    double seconds = 0;
+    neural_selection chosen;
     tss_model base;
     int there;
     if (!neural_frames(v) || v->stopped) return !v->r->why.text[0];
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
     if (!neural_train_phase(v, NEURAL_BASE) || v->stopped) return !v->r->why.text[0];
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
-    int ok = neural_cubature(v, &base, &seconds);
+    int ok = neural_cubature(v, &base, v->d->lipschitz.cubature, &v->cubature, &chosen);
     tss_model_free(&base);
     if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
     if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
@@ -978,13 +1207,14 @@ typedef struct neural_entry {
     int used;
     tss_model m;
     tss_reduced *s;
+    tss_elements *cells;  // solver.cubature; NULL: all
     // Of each step of the tests: s (the shortest of --repeat), counts, exit, and what remains of the
     // gradient, J; distance from full space over the diagonal, of all nodes and the farthest.
     double *seconds, *gradient, *energy, *mean, *farthest;
     int *iterations, *evaluations, *exit;
     // Distance of the tests' states from the nearest that the decoder reaches, over the diagonal.
     double projection_mean, projection_farthest;
-    double lip, lip_decoder, z_scale, train_seconds;  // Eq. 7, with handles and without; spread of z: lip · spread³ does not see z stretched
+    double lip[3], lip_decoder, z_scale, train_seconds;  // Eq. 7 and its orders 0 and 1 (Eq. 12), with handles; without; spread of z: lip · spread³ does not see z stretched
 } neural_entry;
 
 typedef struct neural_trial {
@@ -1027,8 +1257,14 @@ static int neural_entry_open(neural_trial *t, int which) {
     if (!there)
         return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
                     v->r->o.seed, v->r->o.scene);
+    neural_selection chosen;
+    if (!neural_cubature(v, &e->m, d->solver.cubature, &e->cells, &chosen)) return 0;
     tss_reduced_def rd = tss_reduced_def_default();
-    rd.decoder = e->m.decoder, rd.elements = v->elements, rd.mass = v->mass, rd.h = v->h;
+    rd.decoder = e->m.decoder, rd.elements = e->cells ? e->cells : v->elements, rd.mass = v->mass, rd.h = v->h;
+    if (v->ball.radius > 0) {
+        rd.sdf = tss_sdf_ball, rd.sdf_user = &v->ball, rd.contact_stiffness = v->ball_stiffness;
+        rd.contact_margin = v->ball_margin, rd.contact_weight = v->area;
+    }
     rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
     rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
     tss_host host = tss_host_default();
@@ -1074,7 +1310,7 @@ static int neural_trial_open(neural *v, neural_trial *t) {
 
 static void neural_trial_close(neural_trial *t) {
     for (int k = 0; k < NEURAL_TRIALS; k++) {
-        tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m);
+        tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m), tss_elements_destroy(t->e[k].cells);
         free(t->e[k].seconds), free(t->e[k].iterations);
     }
     free(t->room);
@@ -1091,17 +1327,26 @@ static void neural_distance(const neural_trial *t, const double *x, const double
     }
 }
 
+static double neural_cpu(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// With one thread the time that it ran: what else the machine does then counts little.
+static double neural_clock(const neural *v) { return v->r->o.threads == 1 ? neural_cpu() : now(NULL); }
+
 // Step k of a sequence by one subspace; `at`: of all test steps. Seconds include decoding.
 static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
     neural *v = t->v;
     tss_reduced_info i;
-    double began = now(NULL);
+    double began = neural_clock(v);
     tss_result r = tss_reduced_set_handles(e->s, v->handles, v->handle, t->target);
     tss_reduced_set_force(e->s, t->force);
     if (r == TSS_OK) r = tss_reduced_step(e->s, &i);
     if (r != TSS_OK) return fail(v->r, "%s: test step %d: %s", v->r->o.scene, at + 1, tss_result_text(r));
     const double *x = tss_reduced_x(e->s);
-    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began);
+    e->seconds[at] = fmin(e->seconds[at], neural_clock(v) - began);
     e->iterations[at] = i.iterations, e->evaluations[at] = i.evaluations, e->exit[at] = (int)i.exit;
     e->gradient[at] = i.gradient, e->energy[at] = i.energy;
     neural_distance(t, x, tss_world_positions(v->r->w), &e->mean[at], &e->farthest[at]);
@@ -1112,14 +1357,14 @@ static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
 static int neural_trial_full(neural_trial *t, const neural_script *s, int k, int at) {
     neural_entry *e = &t->e[NEURAL_TRIAL_FULL];
     tss_step_info i;
-    double began = now(NULL);
+    double began = neural_clock(t->v);
     e->iterations[at] = 0, e->exit[at] = TSS_EXIT_CONVERGED;
     for (int q = k - t->v->d->script.stride + 1; q <= k; q++) {
         if (!neural_full_step(t->v, s, q, t->room, &i)) return 0;
         e->iterations[at] += i.newton;
         if (i.status != TSS_STEP_CONVERGED) e->exit[at] = TSS_EXIT_ITERATIONS;
     }
-    e->seconds[at] = fmin(e->seconds[at], now(NULL) - began), e->evaluations[at] = e->iterations[at];
+    e->seconds[at] = fmin(e->seconds[at], neural_clock(t->v) - began), e->evaluations[at] = e->iterations[at];
     e->energy[at] = tss_elements_potential(t->v->elements, tss_world_positions(t->v->r->w), NULL);
     return 1;
 }
@@ -1197,7 +1442,7 @@ static void neural_table(const neural_trial *t) {
         printf("%-10s %9.3f %7.1f %7.1f %24s %10.3g %10.5g %10.3g %10.3g %10.3g %9.4g\n", neural_trial_names[k],
                1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n), exits,
                neural_mean(e->gradient, n), neural_mean(e->energy, n), neural_mean(e->mean, n), neural_most(e->farthest, n),
-               e->projection_mean, e->lip);
+               e->projection_mean, e->lip[2]);
     }
 }
 
@@ -1231,8 +1476,8 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
     double *z = neural_z(v, &e->m, x, count);
-    tss_result r = neural_eq7(v, &e->m, v->elements, 1, count, x, z, &e->lip);
-    if (r == TSS_OK) r = neural_eq7(v, &e->m, v->elements, 0, count, x, z, &e->lip_decoder);
+    tss_result r = neural_eq7(v, &e->m, v->elements, 0, 2, count, x, z, &e->lip_decoder);
+    for (int o = 0; o < 3 && r == TSS_OK; o++) r = neural_eq7(v, &e->m, v->elements, 1, o, count, x, z, &e->lip[o]);
     double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     e->z_scale = neural_z_scale(z, count, v->d->r, mean);
     free(x), free(z), free(mean);
@@ -1266,18 +1511,19 @@ static int neural_rows(neural_trial *t) {
     if (!old)
         fputs("system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,"
               "exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,projection_max,simulation_max,"
-              "energy,z_scale,lip_relative,lipschitz_weight,solver,lip_decoder\n", f);
+              "energy,z_scale,lip_relative,lipschitz_weight,solver,lip_0,lip_1,order,eps,runtime_cells,lip_decoder\n", f);
     for (int k = 0; k < NEURAL_TRIALS; k++) {
         const neural_entry *e = &t->e[k];
         if (!e->used) continue;
-        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s,%.6g\n",
+        fprintf(f, "%s,%s,%d,%d,%d,%d,%.6g,%.6g,%.6g,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.8g,%.6g,%.6g,%.6g,%s,%.6g,%.6g,%d,%g,%d,%.6g\n",
                 sweep_name(v->r, name), neural_trial_names[k], v->r->o.seed, v->n, v->cells, k == NEURAL_TRIAL_FULL ? v->n : v->d->r,
                 1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n),
                 neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE), neural_exits(e, n, TSS_EXIT_LINE_SEARCH),
-                neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip, e->projection_mean,
+                neural_exits(e, n, TSS_EXIT_ITERATIONS), neural_mean(e->gradient, n), e->lip[2], e->projection_mean,
                 neural_mean(e->mean, n), e->train_seconds, e->projection_farthest, neural_most(e->farthest, n),
-                neural_mean(e->energy, n), e->z_scale, e->lip * pow(e->z_scale, 3), k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
-                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind], e->lip_decoder);
+                neural_mean(e->energy, n), e->z_scale, e->lip[2] * pow(e->z_scale, 3), k == NEURAL_TRIAL_LIPSCHITZ ? v->d->lipschitz.weight : 0,
+                k == NEURAL_TRIAL_FULL ? "newton" : scene__reduced_solvers[v->d->solver.kind], e->lip[0], e->lip[1],
+                v->d->lipschitz.order, v->d->solver.eps, e->cells ? v->d->solver.cubature : v->cells, e->lip_decoder);
     }
     return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
 }
@@ -1293,12 +1539,127 @@ static int neural_evaluate(neural *v) {
         printf("speedup %.3f evaluations %.3f lip %.3f (relative to the spread of z %.3f, without handles %.3f) projection %.3f simulation %.3f "
                "(vanilla over lipschitz, the last two the other way)\n",
                neural_mean(a->seconds, t.steps) / neural_mean(b->seconds, t.steps),
-               neural_mean_of(a->evaluations, t.steps) / neural_mean_of(b->evaluations, t.steps), a->lip / b->lip,
-               a->lip * pow(a->z_scale, 3) / (b->lip * pow(b->z_scale, 3)), a->lip_decoder / b->lip_decoder,
+               neural_mean_of(a->evaluations, t.steps) / neural_mean_of(b->evaluations, t.steps), a->lip[2] / b->lip[2],
+               a->lip[2] * pow(a->z_scale, 3) / (b->lip[2] * pow(b->z_scale, 3)), a->lip_decoder / b->lip_decoder,
                b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
         ok = neural_rows(&t);
     }
     neural_trial_close(&t);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_measure: the cubature against all cells on the base, at states that did not choose it, and
+// what a step of training costs without L_LS, with it, and with it on the cubature. CPU seconds of
+// this thread, the three in turns, the shortest of each: others on the machine count little.
+// ---------------------------------------------------------------------------------------------
+
+#define NEURAL_TURNS 12  // of training steps
+
+// ‖a − b‖ / ‖b‖ of a vector a state, the mean.
+static double neural_relative(int count, int width, const double *a, const double *b) {
+    double mean = 0;
+    for (int k = 0; k < count; k++) {
+        double d = 0, n = 0;
+        for (int i = k * width; i < (k + 1) * width; i++) d += (a[i] - b[i]) * (a[i] - b[i]), n += b[i] * b[i];
+        mean += n > 0 ? sqrt(d / n) / count : 0;
+    }
+    return mean;
+}
+
+// States for errors: encoded tests; unsupervised: N(0, I), behind those that chose the cells.
+static double *neural_other_states(neural *v, const tss_model *m, int count) {
+    size_t r = (size_t)v->d->r, skip = (size_t)v->d->lipschitz.samples;
+    double *x = neural_spread(v, v->test, v->tests, count);
+    double *z = neural_z(v, m, x, v->d->unsupervised ? count + (int)skip : count);
+    if (v->d->unsupervised) memmove(z, z + skip * r, (size_t)count * r * sizeof *z);
+    free(x);
+    return z;
+}
+
+// error: relative, of ∇P, of ∇²P, of L_LS.
+static int neural_cubature_errors(neural *v, const tss_model *m, double error[3]) {
+    int r = v->d->r, count = NEURAL_SAMPLES;
+    size_t n = (size_t)count * (size_t)r;
+    double *z = neural_other_states(v, m, count), *g[2], *H[2], loss[2];
+    const tss_elements *e[2] = {v->cubature ? v->cubature : v->elements, v->elements};
+    tss_lipschitz_def d = neural_lipschitz(v);
+    tss_result ok = TSS_OK;
+    d.estimator = TSS_LIPSCHITZ_EXACT;
+    for (int k = 0; k < 2; k++) {
+        g[k] = (double *)need(n * (size_t)(r + 1), sizeof(double)), H[k] = g[k] + n;
+        if (ok == TSS_OK) ok = tss_reduced_potential(m->decoder, e[k], v->work, count, z, NULL, g[k], H[k]);
+        if (ok == TSS_OK) ok = tss_loss_lipschitz(m->decoder, e[k], v->work, &d, count, z, NULL, 1, &loss[k], NULL, NULL);
+    }
+    if (ok == TSS_OK) {
+        error[0] = neural_relative(count, r, g[0], g[1]), error[1] = neural_relative(count, r * r, H[0], H[1]);
+        error[2] = fabs(loss[0] - loss[1]) / loss[1];
+    }
+    free(z), free(g[0]), free(g[1]);
+    return ok == TSS_OK ? 1 : fail(v->r, "%s: measure: %s", v->r->o.scene, tss_result_text(ok));
+}
+
+// seconds[0..2]: vanilla; L_LS on all cells; L_LS on the cubature. Nothing is written.
+static int neural_step_costs(neural *v, double seconds[3]) {
+    neural_trainer t[3];
+    tss_elements *cubature = v->cubature;
+    int ok = 1;
+    memset(t, 0, sizeof t);
+    for (int k = 0; ok && k < 3; k++) {
+        v->cubature = k == 1 ? NULL : cubature;
+        seconds[k] = INFINITY;
+        ok = neural_trainer_open(v, k == 0 ? NEURAL_VANILLA : NEURAL_LIPSCHITZ, &t[k]);
+    }
+    for (int turn = 0; ok && turn < 3 * NEURAL_TURNS; turn++) {
+        int k = turn % 3;
+        tss_training_info i;
+        v->cubature = k == 1 ? NULL : cubature;
+        double began = neural_cpu();
+        tss_result e = t[k].t ? tss_training_step(t[k].t, &i) : neural_step(&t[k], &i);
+        seconds[k] = fmin(seconds[k], neural_cpu() - began);
+        if (e != TSS_OK) ok = fail(v->r, "%s: training: %s", v->r->o.scene, tss_result_text(e));
+    }
+    v->cubature = cubature;
+    for (int k = 0; k < 3; k++)
+        if (t[k].v) neural_trainer_close(&t[k]);
+    return ok;
+}
+
+static int neural_measure_row(neural *v, const neural_selection *s, const double error[3], const double seconds[3]) {
+    char path[700], name[120], machine[160];
+    snprintf(path, sizeof path, "%s/measure.csv", v->r->o.out);
+    int old = access(path, F_OK) == 0;
+    FILE *f = fopen(path, "a");
+    if (!f) return fail(v->r, "%s: cannot be written: %s", path, strerror(errno));
+    neural_machine(machine);
+    fprintf(f, "# %s, one thread, best of %d\n", machine, NEURAL_TURNS);
+    if (!old)
+        fputs("system,seed,dof,elements,r,wanted,cells,select_seconds,select_error,gradient_error,hessian_error,loss_error,"
+              "vanilla_ms,all_ms,cubature_ms,estimator,batch,lipschitz_batch\n", f);
+    fprintf(f, "%s,%d,%d,%d,%d,%d,%d,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%.6g,%s,%d,%d\n", sweep_name(v->r, name), v->r->o.seed, v->n,
+            v->cells, v->d->r, v->d->lipschitz.cubature, s->cells, s->seconds, s->error, error[0], error[1], error[2], 1e3 * seconds[0], 1e3 * seconds[1],
+            1e3 * seconds[2], scene__estimators[v->d->lipschitz.estimator], v->d->train.batch, v->d->lipschitz.batch);
+    return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
+}
+
+static int neural_measure(neural *v) {
+    tss_model base;
+    neural_selection s;
+    double error[3] = {0, 0, 0}, seconds[3];
+    int there;
+    if (v->r->o.threads != 1) return fail(v->r, "tss neural measure: expected --threads 1 (it counts the CPU time of one)");
+    if (v->d->lipschitz.order != 2 || !(v->d->lipschitz.weight > 0))
+        return fail(v->r, "%s: neural.lipschitz: expected order 2 and a weight above 0 for measure", v->r->o.scene);
+    if (!neural_frames(v) || v->stopped) return !v->r->why.text[0];
+    if (!v->d->unsupervised && !neural_basis(v)) return 0;
+    if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
+    if (!there) return fail(v->r, "%s/base_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, v->r->o.seed, v->r->o.scene);
+    int ok = neural_cubature(v, &base, v->d->lipschitz.cubature, &v->cubature, &s) && neural_cubature_errors(v, &base, error);
+    tss_model_free(&base);
+    ok = ok && neural_step_costs(v, seconds) && neural_measure_row(v, &s, error, seconds);
+    if (ok)
+        printf("%d of %d cells, r %d: error of the gradient %.3g, Hessian %.3g, L_LS %.3g; a step %.3g ms, with L_LS %.3g, on the cubature %.3g\n",
+               s.cells, v->cells, v->d->r, error[0], error[1], error[2], 1e3 * seconds[0], 1e3 * seconds[1], 1e3 * seconds[2]);
     return ok;
 }
 
@@ -1323,6 +1684,16 @@ static void neural_draw_state(run *r, const double *x, const float color[3]) {
     draw_body(r, 0);
 }
 
+static void neural_draw_ball(const neural *v) {
+    tss_mesh m;
+    view_style style = view_style_default();
+    if (v->ball.radius == 0 || tss_shape_ball_surface(NULL, v->ball.radius, 24, &m) != TSS_OK) return;
+    tss_mesh_translate(&m, v->ball.center[0], v->ball.center[1], v->ball.center[2]);
+    memcpy(style.colour, obstacle_color, sizeof style.colour);
+    view_add_mesh(v->r->view, m.x, m.nodes, m.triangle, m.triangles, &style);
+    tss_mesh_free(&m);
+}
+
 // The subspace's state in blue over full space in purple.
 static int neural_shoot(neural_trial *t, neural_album *a) {
     static const float blue[3] = {0.25f, 0.55f, 0.85f}, purple[3] = {0.62f, 0.40f, 0.72f};
@@ -1333,6 +1704,7 @@ static int neural_shoot(neural_trial *t, neural_album *a) {
         view_begin(r->view, &r->camera, &look);
         neural_draw_state(r, tss_world_positions(r->w), purple);
         neural_draw_state(r, tss_reduced_x(t->e[q].s), blue);
+        neural_draw_ball(t->v);
         view_image im = view_render(r->view);
         if (!im.rgb) return fail(r, "out of memory for a picture");
         a->label[a->shots] = neural_trial_names[q];
@@ -1427,7 +1799,8 @@ static int neural_run(neural *v) {
 static int command_neural(run *r) {
     static neural v;
     int ok = neural_open(r, &v);
-    if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v) : neural_evaluate(&v);
+    if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v)
+                  : strcmp(r->o.action, "measure") == 0 ? neural_measure(&v) : neural_evaluate(&v);
     neural_close(&v);
     return !ok ? 2 : v.stopped ? 3 : 0;
 }

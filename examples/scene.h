@@ -61,6 +61,8 @@
     .mesh                  file: .msh .mesh .node .obj .ply .seg; beside the scene, under --assets
     .shape                 instead of mesh, see below
     .scale .rotate .translate   number or vector (1); Rx Ry Rz, degrees; m. In this order
+    .shell                 a surface of triangles as cloth, with `neural` alone: {thickness, m; bending:
+                           k of its hinges, J (0)}
     .obstacle              its surface moves as told (false); surfaces, segments, points must be
     .material              {kind, E, nu, rho, damping}: neo_hookean | stable_neo_hookean |
                            fixed_corotated | stvk | linear (neo_hookean), Pa (1e5), (0.4),
@@ -114,6 +116,8 @@
                            behind those of training, not on the tests (false)}
      .handles[]            {lower, upper, metres: nodes, as in pins; translate, rotate: [[low x, y, z],
                            [high]], m, and degrees along the axis, about the middle of the nodes}
+     .ball                 walks as handles do: {radius, m; center: [[low x, y, z], [high]], m, from low;
+                           stiffness: of its penalty, N/m³; margin: m (0)}
      .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
     .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300)}
     .train                 vanilla: {steps (20000), batch (64), rate (1e-3), rate_end (1e-5), warmup
@@ -126,7 +130,7 @@
                            groups of frames this near under one's handles (0: off), cubature: cells,
                            0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
-                           (10), max_line (128), max_iterations (1024)}
+                           (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0)}
     .samples               of Eq. 7 (256)
 
    IPC SCRIPTS  time density stiffness energy timeIntegration dampingStiff dampingRatio
@@ -208,6 +212,7 @@ typedef struct scene_body {
     double *rest;            // nodes × 3; NULL: mesh.x
     int obstacle, collider;  // collider: a script's meshCO
     tss_material material;
+    double shell, bending;  // thickness, m, 0: not a shell; k of its hinges, J. For `neural` alone
     double *E, *nu, *rho;  // of each cell; NULL: material's
     scene_basis *basis;
     int bases;
@@ -246,6 +251,9 @@ typedef struct scene_neural {
         scene_pull *pull;
         int handles, pulls, length, train, test, seed, stride, validate;
         double hold[2];
+        struct {  // radius 0: none
+            double radius, center[2][3], stiffness, margin;
+        } ball;
     } script;
     struct {
         double tol;
@@ -260,7 +268,7 @@ typedef struct scene_neural {
         double rate, rate_end, weight;
     } lipschitz;
     struct {
-        int kind, memory, max_line, max_iterations;
+        int kind, memory, max_line, max_iterations, cubature;
         double eps, ftol;
     } solver;
 } scene_neural;
@@ -1297,6 +1305,15 @@ static int scene__read_material(scene__reader *r, const cJSON *v, void *base) {
                               base);  // b is the first member of a raw body
 }
 
+static const scene__key scene__shell_keys[] = {
+    SCENE__POS(scene_body, shell, "thickness"), SCENE__NUM(scene_body, bending, "bending", 0, 1e300), SCENE__END};
+
+static int scene__read_shell(scene__reader *r, const cJSON *v, void *base) {
+    scene_body *b = (scene_body *)base;
+    if (!scene__read_object(r, v, scene__shell_keys, b)) return 0;
+    return b->shell > 0 || scene__expected(r, v, "a thickness, m");
+}
+
 static int scene__read_body_motion(scene__reader *r, const cJSON *v, void *base) {
     return scene__read_motion(r, v, &((scene_body *)base)->motion);
 }
@@ -1324,6 +1341,7 @@ static const scene__key scene__body_keys[] = {
     SCENE__OF(SCENE__VECTOR, scene__raw, rotate, "rotate"),
     SCENE__OF(SCENE__VECTOR, scene__raw, translate, "translate"),
     SCENE__FUN("material", scene__read_material),
+    SCENE__FUN("shell", scene__read_shell),
     SCENE__OF(SCENE__VECTOR, scene__raw, b.velocity, "velocity"),
     SCENE__OF(SCENE__DEGREES, scene__raw, b.angular, "angular_velocity"),
     SCENE__FUN("pins", scene__keep_pins),
@@ -1545,7 +1563,10 @@ static int scene__body_check(scene__reader *r, const scene_body *b) {
             if (m->x[3 * i + 2] != 0)
                 return scene__fail(r->error, "%s: %s: node %d has z = %g, expected 0 in 2D",
                                    r->s->file, r->where, i, m->x[3 * i + 2]);
-    if (!b->obstacle && cells == 0)
+    if (b->shell > 0 && (b->obstacle || r->s->world.dim != 3 || m->tets > 0 || m->triangles == 0))
+        return scene__fail(r->error, "%s: %s.shell: expected a soft surface of triangles in 3D (shape \"sheet\", or a mesh)",
+                           r->s->file, r->where);
+    if (!b->obstacle && cells == 0 && b->shell == 0)
         return scene__fail(
             r->error, "%s: %s: %s has no %s; surfaces and segments need \"obstacle\": true",
             r->s->file, r->where, b->name, r->s->world.dim == 3 ? "tets" : "triangles");
@@ -1791,7 +1812,23 @@ static int scene__read_hidden(scene__reader *r, const cJSON *v, void *base) {
     return n->layers > 0;
 }
 
+static int scene__read_ball_center(scene__reader *r, const cJSON *v, void *base) {
+    return scene__read_range(r, v, 1, ((scene_neural *)base)->script.ball.center);
+}
+static const scene__key scene__ball_keys[] = {
+    SCENE__POS(scene_neural, script.ball.radius, "radius"),
+    SCENE__FUN("center", scene__read_ball_center),
+    SCENE__POS(scene_neural, script.ball.stiffness, "stiffness"),
+    SCENE__NUM(scene_neural, script.ball.margin, "margin", 0, 1e300),
+    SCENE__END};
+static int scene__read_ball(scene__reader *r, const cJSON *v, void *base) {
+    const scene_neural *n = (const scene_neural *)base;
+    if (!scene__read_object(r, v, scene__ball_keys, base)) return 0;
+    return (n->script.ball.radius > 0 && n->script.ball.stiffness > 0) || scene__expected(r, v, "a radius, m, and a stiffness, N/m\xc2\xb3");
+}
+
 static const scene__key scene__script_keys[] = {
+    SCENE__FUN("ball", scene__read_ball),
     SCENE__FUN("handles", scene__read_handles),
     SCENE__FUN("pulls", scene__read_pulls),
     SCENE__OF(SCENE__PAIR, scene_neural, script.hold, "hold"),
@@ -1840,6 +1877,7 @@ static const scene__key scene__reduced_keys[] = {
     SCENE__INT(scene_neural, solver.memory, "memory", 1, 64),
     SCENE__INT(scene_neural, solver.max_line, "max_line", 1, 1e6),
     SCENE__INT(scene_neural, solver.max_iterations, "max_iterations", 1, 1e9),
+    SCENE__INT(scene_neural, solver.cubature, "cubature", 0, 1e6),
     SCENE__END};
 
 static int scene__read_script_of(scene__reader *r, const cJSON *v, void *base) {
@@ -1939,6 +1977,9 @@ static int scene__read_root(scene__reader *r, const cJSON *root) {
     if (dim && cJSON_IsNumber(dim) && dim->valueint == 2) r->s->world.dim = 2;
     if (!scene__read_object(r, root, scene__root_keys, r->s)) return 0;
     const cJSON *neural = cJSON_GetObjectItemCaseSensitive(root, "neural");
+    for (int k = 0; k < r->s->bodies; k++)
+        if (r->s->body[k].shell > 0 && (!neural || k > 0))
+            return scene__fail(r->error, "%s: bodies[%d].shell: expected on the first body of a scene with \"neural\"", r->s->file, k);
     return neural ? scene__read_neural(r, neural) : 1;
 }
 
@@ -2767,6 +2808,8 @@ static int scene__add_to_world(const scene *s, scene_body *b, tss_world *w, scen
     memcpy(d.velocity, b->velocity, sizeof d.velocity);
     if (b->obstacle) {
         scene__surface_def(b, &d);
+    } else if (b->shell > 0) {
+        d.triangles = b->mesh.triangles, d.triangle = b->mesh.triangle, d.thickness = b->shell;
     } else {
         d.cells = dim == 3 ? b->mesh.tets : b->mesh.triangles;
         d.cell = dim == 3 ? b->mesh.tet : b->mesh.triangle;

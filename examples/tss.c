@@ -8,7 +8,7 @@
    tss compare --sweep SCENE [--nodes LIST] [--modes LIST] [--tols LIST] [--name NAME] ...
    tss modes SCENE [-o DIR] [--count K] ...
    tss check SCENE [--assets DIR] [--set key=value]...
-   tss neural train|run|evaluate SCENE [-o DIR] [--seed N] [--minutes M]
+   tss neural train|run|evaluate|measure SCENE [-o DIR] [--seed N] [--minutes M]
               [--method vanilla|lipschitz] [--threads N] [--set key=value]...
    tss --version | --help
 
@@ -94,7 +94,7 @@ static int usage(FILE *to) {
         "               [--name NAME], and the options of compare\n"
         "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
-        "       tss neural train|run|evaluate SCENE [-o DIR] [--seed N] [--minutes M]\n"
+        "       tss neural train|run|evaluate|measure SCENE [-o DIR] [--seed N] [--minutes M]\n"
         "               [--method vanilla|lipschitz] [--threads N] [--set key=value]...\n"
         "       tss --version\n",
         to);
@@ -216,8 +216,10 @@ static int read_options(int argc, char **argv, options *o) {
     int first = 2;
     if (strcmp(o->command, "neural") == 0) {
         o->action = argc > 2 ? argv[2] : "";
-        if (strcmp(o->action, "train") != 0 && strcmp(o->action, "run") != 0 && strcmp(o->action, "evaluate") != 0)
-            return complain("neural", o->action, "train, run or evaluate");
+        static const char *const actions[] = {"train", "run", "evaluate", "measure"};
+        int k = 0;
+        while (k < 4 && strcmp(o->action, actions[k]) != 0) k++;
+        if (k == 4) return complain("neural", o->action, "train, run, evaluate or measure");
         first = 3;
     }
     for (int k = first; k < argc; k++) {

@@ -36,7 +36,23 @@ claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_b
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >>"$build/neural_c.log" 2>&1'
 # refused WORDS ARGUMENTS: exit 2 and these words
 refused() { words=$1; shift; tss "$@" >"$build/neural_bad.log" 2>&1; [ $? = 2 ] && grep -q -e "$words" "$build/neural_bad.log"; }
-claim "neural: refused: another action" 'refused "expected train, run or evaluate" walk "$out/a"'
+claim "neural: measures" 'tss measure "$out/a" --threads 1 >>"$build/neural.log" 2>&1 && grep -q "^neural_twist_bar_small,0,135,80,4,20,20," "$out/a/measure.csv"'
+claim "neural: a cubature at run time" 'tss evaluate "$out/a" --set neural.solver.cubature=20 >>"$build/neural.log" 2>&1 &&
+    [ "$(awk -F, "\$2 == \"lipschitz\" {c = \$NF} END {print c}" "$out/a/evaluate.csv")" = 20 ]'
+# cloth ACTION OPTION...
+cloth() {
+    action=$1; shift
+    "$build/tss" neural "$action" examples/scenes/neural_cloth_small.json -o "$out/d" --set bodies.0.shape.cells=[6,1,6] \
+        --set neural.script.length=15 --set neural.script.test=1 --set neural.script.hold=[5,8] --set neural.train.steps=60 \
+        --set neural.lipschitz.steps=20 --set neural.lipschitz.cubature=20 --set neural.samples=8 --set frames.size=[160,96] "$@" >"$build/neural_d.log" 2>&1
+}
+claim "neural: cloth and a ball" 'cloth train && cloth evaluate && cloth run && [ -s "$out/d/states_0.png" ]'
+claim "neural: cloth: full space converges" '[ "$(awk -F, "\$2 == \"full\" {print \$10, \$13}" "$out/d/evaluate.csv")" = "15 0" ]'
+bad_cloth() { words=$1; shift; cloth train "$@"; [ $? = 2 ] && grep -q -e "$words" "$build/neural_d.log"; }
+claim "neural: refused: a shell of tets" 'bad_cloth "expected a soft surface of triangles" --set bodies.0.shape.kind=box --set bodies.0.shape.upper=[1,1,1]'
+claim "neural: refused: a ball without a radius" 'bad_cloth "radius" --set neural.script.ball.radius=0'
+claim "neural: refused: a ball that meets no shell" 'refused "expected a first body with \"shell\"" train "$out/a" --set neural.script.ball.radius=1 --set neural.script.ball.stiffness=1'
+claim "neural: refused: another action" 'refused "expected train, run, evaluate or measure" walk "$out/a"'
 claim "neural: refused: a key" 'refused "neural.lipschitz.weigth: no such key; did you mean \"weight\"" train "$out/a" --set neural.lipschitz.weigth=1'
 claim "neural: refused: a value" 'refused "neural.r is 0, expected a whole number" train "$out/a" --set neural.r=0'
 claim "neural: refused: low above high" 'refused "low <= high" train "$out/a" --set "neural.script.handles.0.rotate=[[1,0,0],[0,0,0]]"'

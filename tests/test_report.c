@@ -341,6 +341,60 @@ static void test_pages(void **state) {
     free(h);
 }
 
+// Speeds over vanilla, means over seeds and percentages of exits, of numbers chosen so that they are
+// known: vanilla 4 and 8 ms, lipschitz 2 and 4.
+#define NEURAL_ROW(system, method, seed, ms, solver, order, eps, cells) \
+    system "," method "," seed ",567,400,10," ms ",30,40,3,1,0,0,1e-5,120,0.01,0.02,9,0.03,0.04,-1,0.5,15,1e-8," \
+        solver ",1,2," order "," eps "," cells "\n"
+#define MEASURE_ROW(system, r, cells, estimator) \
+    system ",0,567,400," r "," cells "," cells ",0.5,0.1,0.2,0.3,0.4,1,50,5," estimator ",64,16\n"
+
+static void neural_files(void) {
+    static const char *const name[] = {"", "_newton", "_eps", "_order", "_runtime", "_r"};
+    static const char lines[] =
+        NEURAL_ROW("bar <1>", "vanilla", "0", "4", "lbfgs", "2", "1e-5", "400")
+        NEURAL_ROW("bar <1>", "vanilla", "1", "8", "lbfgs", "2", "1e-5", "400")
+        NEURAL_ROW("bar <1>", "lipschitz", "0", "2", "lbfgs", "2", "1e-5", "400")
+        NEURAL_ROW("bar <1>", "lipschitz", "1", "4", "lbfgs", "2", "1e-5", "400")
+        NEURAL_ROW("bar <1>", "full", "0", "24", "newton", "2", "1e-5", "400");
+    for (int k = 0; k < 6; k++) {
+        char file[60];
+        snprintf(file, sizeof file, "small/neural%s.csv", name[k]);
+        write_file(file, neural_header, lines);
+    }
+    write_file("small/neural_cubature.csv", measure_header, MEASURE_ROW("bar <1>", "10", "20", "u") MEASURE_ROW("bar <1>", "10", "40", "u"));
+    write_file("small/neural_cost.csv", measure_header,
+               MEASURE_ROW("bar <1>", "4", "150", "u") MEASURE_ROW("bar <1>", "8", "150", "u")
+               MEASURE_ROW("bar <1>", "4", "150", "exact") MEASURE_ROW("bar <1>", "8", "150", "exact"));
+}
+
+static void test_neural(void **state) {
+    (void)state;
+    curves_table t;
+    curves_error why;
+    neural_files();
+    assert_true(curves_table_read(&t, OUT "/small/neural.csv", neural_header, &why));
+    close_to(neural_speed(&t, 2, -1), 2), close_to(neural_speed(&t, 4, -1), 0.25);
+    close_to(neural_speed(&t, 2, SEED), 2);
+    neural_column part = {"", EXIT_CONVERGED, 1}, ms = {"", STEP_MS, 0};
+    int runs;
+    close_to(neural_average(&t, 0, -1, part, NULL), 75), close_to(neural_average(&t, 0, -1, ms, &runs), 6);
+    assert_int_equal(runs, 2);
+    curves_table_free(&t);
+    assert_true(write_pages(OUT "/no", OUT "/small", OUT "/pages"));
+    char *h = page("neural.html");
+    has(h, "2.00 times vanilla&#39;s speed"), has(h, "bar &lt;1&gt;"), has(h, "<td class=\"n good\">2</td>");
+    has(h, "mean exit gradient"), has(h, ">75</td>"), has(h, "a step of training"), has(h, "relative errors");
+    has(h, "projection error"), has(h, "exact L_LS, cubature");
+    free(h);
+    write_file("small/neural.csv", neural_header, "bar,vanilla,0\n");
+    assert_false(write_pages(OUT "/no", OUT "/small", OUT "/pages"));
+    h = page("neural.html"), has(h, "neural.csv: line 2"), free(h);
+    assert_int_equal(remove(OUT "/small/neural.csv"), 0);
+    assert_true(write_pages(OUT "/no", OUT "/none", OUT "/pages"));
+    h = page("neural.html"), has(h, "sh bench/neural.sh"), has(h, "neural_r.csv: not there"), free(h);
+}
+
 static void test_missing_and_broken(void **state) {
     (void)state;
     assert_true(write_pages(OUT "/no", OUT "/none", OUT "/pages"));
@@ -414,7 +468,8 @@ int main(void) {
         cmocka_unit_test(test_table),     cmocka_unit_test(test_recommend),
         cmocka_unit_test(test_dominates), cmocka_unit_test(test_spearman),
         cmocka_unit_test(test_ranks),     cmocka_unit_test(test_stiffness),
-        cmocka_unit_test(test_pages),     cmocka_unit_test(test_missing_and_broken),
+        cmocka_unit_test(test_pages),     cmocka_unit_test(test_neural),
+        cmocka_unit_test(test_missing_and_broken),
         cmocka_unit_test(test_parts),
     };
     return cmocka_run_group_tests(tests, set_up, tear_down);
