@@ -523,7 +523,7 @@ static const char *const neural_header =
     "system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,"
     "exit_line,exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds,"
     "projection_max,simulation_max,energy,z_scale,lip_relative,lipschitz_weight,solver,lip_0,lip_1,"
-    "order,eps,runtime_cells";
+    "order,eps,runtime_cells,lip_decoder";
 static const char *const neural_command = "sh bench/neural.sh";
 
 typedef struct neural_column {
@@ -843,6 +843,7 @@ static int write_pages(const char *results, const char *out, const char *to) {
     return !s.failed;
 }
 
+#ifndef REPORT_NO_MAIN
 // A line a scene for the documentation: the stretch of errors in which adaptive is the cheapest,
 // and its cheapest run of at most 10, 3 and 1 % against full space at the scene's tolerance.
 static int print_text(const char *results) {
@@ -876,7 +877,6 @@ static int print_text(const char *results) {
     return 1;
 }
 
-#ifndef REPORT_NO_MAIN
 int main(int argc, char **argv) {
     const char *to = NULL, *folder[2] = {NULL, NULL};
     int n = 0;

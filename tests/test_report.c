@@ -345,7 +345,7 @@ static void test_pages(void **state) {
 // known: vanilla 4 and 8 ms, lipschitz 2 and 4.
 #define NEURAL_ROW(system, method, seed, ms, solver, order, eps, cells) \
     system "," method "," seed ",567,400,10," ms ",30,40,3,1,0,0,1e-5,120,0.01,0.02,9,0.03,0.04,-1,0.5,15,1e-8," \
-        solver ",1,2," order "," eps "," cells "\n"
+        solver ",1,2," order "," eps "," cells ",120\n"
 #define MEASURE_ROW(system, r, cells, estimator) \
     system ",0,567,400," r "," cells "," cells ",0.5,0.1,0.2,0.3,0.4,1,50,5," estimator ",64,16\n"
 
