@@ -5126,8 +5126,9 @@ static size_t tss__sub_block_room(const tss_subspace *s, int body, const tss__su
 static void tss__sub_block_rows(const tss_subspace *s, int body, const tss__sub_block *q, double *U) {
     const tss__modal *m = tss__sub_modal(s, body);
     const tss__sub_basis *b = tss__sub_base(s, q->basis);
-    int f;
-    size_t rows = tss__sub_block_room(s, body, q, &f) / (size_t)f;
+    int f = 0;
+    size_t rows = tss__sub_block_room(s, body, q, &f);
+    rows /= (size_t)f;
     if (b->b.vector)
         for (size_t i = 0; i < rows; i++)
             for (int k = 0; k < f; k++)
