@@ -4711,12 +4711,6 @@ typedef struct tss__ipc_span {
     int id;
 } tss__ipc_span;
 
-static int tss__ipc_span_order(const void *a, const void *b) {
-    const tss__ipc_span *s = (const tss__ipc_span *)a, *t = (const tss__ipc_span *)b;
-    if (s->box[0] != t->box[0]) return s->box[0] < t->box[0] ? -1 : 1;
-    return s->id < t->id ? -1 : s->id > t->id;
-}
-
 static int tss__ipc_is_fresh(const tss_ctx *c, const int *v, int arity) {
     int fresh = !c->fresh;
     for (int k = 0; !fresh && k < arity; k++) fresh = c->fresh[v[k]];
@@ -4757,7 +4751,7 @@ static int tss__ipc_boxes_meet(const double a[6], const double b[6], int dim) {
     return meet;
 }
 
-// Boxes of the primitives that meet `box`, sorted by where they begin in x; returns their number.
+// Boxes of the primitives that meet `box`; returns their number.
 static int tss__ipc_spans(const tss_ctx *c, const double *x, const double box[6], int count,
                           int arity, const int *node, tss__ipc_span *out) {
     int kept = 0;
@@ -4767,8 +4761,59 @@ static int tss__ipc_spans(const tss_ctx *c, const double *x, const double box[6]
         out[kept].id = i;
         kept += tss__ipc_boxes_meet(out[kept].box, box, c->dim);
     }
-    qsort(out, (size_t)kept, sizeof *out, tss__ipc_span_order);
     return kept;
+}
+
+#define TSS__IPC_SPAN_LEAF 8
+
+// A tree over spans, in place: span[from..to) is halved along the axis in which the middles spread
+// most until TSS__IPC_SPAN_LEAF are left. Node k has children 2k + 1 and 2k + 2; `box` holds theirs.
+static void tss__ipc_span_tree(tss__ipc_span *span, int from, int to, int k, double (*box)[6]) {
+    double mid[6];
+    tss__ipc_empty(box[k]), tss__ipc_empty(mid);
+    for (int i = from; i < to; i++)
+        for (int a = 0; a < 3; a++) {
+            const double *b = span[i].box;
+            double m = b[a] + b[3 + a];
+            box[k][a] = fmin(box[k][a], b[a]), box[k][3 + a] = fmax(box[k][3 + a], b[3 + a]);
+            mid[a] = fmin(mid[a], m), mid[3 + a] = fmax(mid[3 + a], m);
+        }
+    if (to - from <= TSS__IPC_SPAN_LEAF) return;
+    int axis = 0, half = from + (to - from) / 2;
+    for (int a = 1; a < 3; a++)
+        if (mid[3 + a] - mid[a] > mid[3 + axis] - mid[axis]) axis = a;
+    for (int low = from, high = to - 1; low < high;) {  // quickselect (Hoare) of the middle one
+        double pivot = span[low + (high - low) / 2].box[axis] + span[low + (high - low) / 2].box[3 + axis];
+        int i = low, j = high;
+        while (i <= j) {
+            while (span[i].box[axis] + span[i].box[3 + axis] < pivot) i++;
+            while (span[j].box[axis] + span[j].box[3 + axis] > pivot) j--;
+            if (i <= j) {
+                tss__ipc_span swap = span[i];
+                span[i++] = span[j], span[j--] = swap;
+            }
+        }
+        if (half <= j) high = j;
+        else if (half >= i) low = i;
+        else break;
+    }
+    tss__ipc_span_tree(span, from, half, 2 * k + 1, box);
+    tss__ipc_span_tree(span, half, to, 2 * k + 2, box);
+}
+
+// Ids of the spans whose boxes meet e's into `out` (room for all); returns their number.
+static int tss__ipc_span_search(const tss__ipc_span *span, int from, int to, int k, double (*box)[6],
+                                const double e[6], int dim, int *out) {
+    if (!tss__ipc_boxes_meet(box[k], e, dim)) return 0;
+    if (to - from <= TSS__IPC_SPAN_LEAF) {
+        int n = 0;
+        for (int i = from; i < to; i++)
+            if (tss__ipc_boxes_meet(span[i].box, e, dim)) out[n++] = span[i].id;
+        return n;
+    }
+    int half = from + (to - from) / 2;
+    int n = tss__ipc_span_search(span, from, half, 2 * k + 1, box, e, dim, out);
+    return n + tss__ipc_span_search(span, half, to, 2 * k + 2, box, e, dim, out + n);
 }
 
 static int tss__ipc_may_meet(const tss_ipc *p, const tss_ctx *c, const int *e, const int *f,
@@ -4786,47 +4831,86 @@ static int tss__ipc_may_meet(const tss_ipc *p, const tss_ctx *c, const int *e, c
     return !all && !(a == b && self_off[a]) && !(q && q->exclude);
 }
 
-// Reports the first ones and returns how many there are (−1: no memory).
+typedef struct tss__ipc_crossing {
+    int e, f;  // edge; triangle, or edge in 2D
+} tss__ipc_crossing;
+
+typedef struct tss__ipc_hunt {
+    const tss_ipc *p;
+    const tss_ctx *c;
+    const double *x;
+    const tss__ipc_span *edge, *span;
+    double (*box)[6];
+    int edges, count, arity;
+    const int *other;
+    int *hit;                   // a worker's ids, `count` each
+    tss__ipc_crossing *first;  // 8 of each block
+    int *found;                 // of each block
+} tss__ipc_hunt;
+
+#define TSS__IPC_HUNT 256  // edges in a block
+
+static void tss__ipc_hunt_task(int block, int worker, void *arg) {
+    const tss__ipc_hunt *h = (const tss__ipc_hunt *)arg;
+    int *hit = h->hit + (size_t)worker * (size_t)h->count, found = 0;
+    int to = (block + 1) * TSS__IPC_HUNT < h->edges ? (block + 1) * TSS__IPC_HUNT : h->edges;
+    for (int i = block * TSS__IPC_HUNT; i < to; i++) {
+        const tss__ipc_span *e = h->edge + i;
+        const int *v = h->p->surface.edge + 2 * e->id;
+        int n = tss__ipc_span_search(h->span, 0, h->count, 0, h->box, e->box, h->c->dim, hit);
+        for (int k = 0; k < n; k++) {
+            const int *t = h->other + h->arity * hit[k];
+            if ((h->c->dim == 2 && hit[k] <= e->id) || !tss__ipc_may_meet(h->p, h->c, v, t, h->arity)) continue;
+            if (!(h->c->dim == 3 ? tss__ipc_pierces(h->c, h->x, v, t) : tss__ipc_crosses(h->c, h->x, v, t))) continue;
+            if (found < 8) h->first[block * 8 + found].e = e->id, h->first[block * 8 + found].f = hit[k];
+            found++;
+        }
+    }
+    h->found[block] = found;
+}
+
+static void tss__ipc_report_crossing(const tss__ipc_hunt *h, const tss__ipc_crossing *k, tss_issue_fn *add, void *arg) {
+    const int *v = h->p->surface.edge + 2 * k->e, *t = h->other + h->arity * k->f, *body = h->c->body;
+    char text[200];
+    if (h->c->dim == 3)
+        snprintf(text, sizeof text, "edge %d-%d of body %d pierces triangle %d-%d-%d of body %d: move the bodies apart",
+                 v[0], v[1], body[v[0]], t[0], t[1], t[2], body[t[0]]);
+    else
+        snprintf(text, sizeof text, "edge %d-%d of body %d crosses edge %d-%d of body %d: move the bodies apart", v[0],
+                 v[1], body[v[0]], t[0], t[1], body[t[0]]);
+    add(TSS_SEVERITY_ERROR, text, arg);
+}
+
+// Reports the first 8, by edge, and returns how many there are (−1: no memory).
 static int tss__ipc_intersections(tss_ipc *p, const tss_ctx *c, const double *x, tss_issue_fn *add,
                                   void *arg) {
     const tss_surface *s = &p->surface;
-    int arity = c->dim, count = c->dim == 3 ? s->triangles : s->edges, found = 0, first = 0;
+    int arity = c->dim, count = c->dim == 3 ? s->triangles : s->edges, found = 0, nodes = 1;
     const int *other = c->dim == 3 ? s->triangle : s->edge;
+    int blocks = (s->edges + TSS__IPC_HUNT - 1) / TSS__IPC_HUNT;
+    if (s->edges == 0 || count == 0) return 0;
+    for (int most = count; most > TSS__IPC_SPAN_LEAF; most = (most + 1) / 2) nodes = 2 * nodes + 1;
+    size_t spans = (size_t)(s->edges + count), hits = (size_t)tss_workers(p->host) * (size_t)count;
+    size_t bytes = spans * sizeof(tss__ipc_span) + (size_t)nodes * 6 * sizeof(double) +
+                   (size_t)blocks * 8 * sizeof(tss__ipc_crossing) + ((size_t)blocks + hits) * sizeof(int);
     tss__ipc_array memory = {NULL, 0};
-    tss__ipc_span *e =
-        (tss__ipc_span *)tss__ipc_fit(p->host, &memory, (size_t)(s->edges + count) * sizeof *e);
-    double widest = 0, box[6];
+    tss__ipc_span *e = (tss__ipc_span *)tss__ipc_fit(p->host, &memory, bytes);
     if (!e) return -1;
     tss__ipc_span *f = e + s->edges;
+    double(*tree)[6] = (double(*)[6])(void *)(f + count), box[6];
     tss__ipc_fresh_box(p, c, x, box);
-    int edges = tss__ipc_spans(c, x, box, s->edges, 2, s->edge, e);
-    count = tss__ipc_spans(c, x, box, count, arity, other, f);
-    for (int i = 0; i < count; i++)
-        widest = f[i].box[3] - f[i].box[0] > widest ? f[i].box[3] - f[i].box[0] : widest;
-    for (int i = 0; i < edges; i++) {
-        const int *v = s->edge + 2 * e[i].id;
-        while (first < count && f[first].box[0] < e[i].box[0] - widest) first++;
-        for (int k = first; k < count && f[k].box[0] <= e[i].box[3]; k++) {
-            const int *t = other + arity * f[k].id;
-            if (!tss__ipc_boxes_meet(f[k].box, e[i].box, c->dim) || (c->dim == 2 && f[k].id <= e[i].id) ||
-                !tss__ipc_may_meet(p, c, v, t, arity))
-                continue;
-            if (!(c->dim == 3 ? tss__ipc_pierces(c, x, v, t) : tss__ipc_crosses(c, x, v, t)))
-                continue;
-            if (found++ >= 8 || !add) continue;
-            char text[200];
-            if (c->dim == 3)
-                snprintf(text, sizeof text,
-                         "edge %d-%d of body %d pierces triangle %d-%d-%d of body %d: move the "
-                         "bodies apart",
-                         v[0], v[1], c->body[v[0]], t[0], t[1], t[2], c->body[t[0]]);
-            else
-                snprintf(
-                    text, sizeof text,
-                    "edge %d-%d of body %d crosses edge %d-%d of body %d: move the bodies apart",
-                    v[0], v[1], c->body[v[0]], t[0], t[1], c->body[t[0]]);
-            add(TSS_SEVERITY_ERROR, text, arg);
-        }
+    tss__ipc_hunt h = {p, c, x, e, f, tree, 0, 0, arity, other, NULL, NULL, NULL};
+    h.edges = tss__ipc_spans(c, x, box, s->edges, 2, s->edge, e);
+    h.count = tss__ipc_spans(c, x, box, count, arity, other, f);
+    h.first = (tss__ipc_crossing *)(void *)(tree + nodes);
+    h.found = (int *)(void *)(h.first + blocks * 8), h.hit = h.found + blocks;
+    tss__ipc_span_tree(f, 0, h.count, 0, tree);
+    blocks = (h.edges + TSS__IPC_HUNT - 1) / TSS__IPC_HUNT;
+    tss_parallel(p->host, blocks, tss__ipc_hunt_task, &h);
+    for (int k = 0; k < blocks; k++) {
+        for (int i = 0; add && i < 8 && i < h.found[k] && found + i < 8; i++)
+            tss__ipc_report_crossing(&h, h.first + k * 8 + i, add, arg);
+        found += h.found[k];
     }
     tss__ipc_drop(p->host, &memory);
     return found;

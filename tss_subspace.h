@@ -3823,19 +3823,39 @@ static int tss__sub_choose_inertia(tss_subspace *s, const tss_energy_view *v, in
     return any;
 }
 
+typedef struct tss__sub_clearing {
+    tss_subspace *s;
+    int rows;
+} tss__sub_clearing;
+
+// Clears the marked rows of A, neighbours in one go.
+static void tss__sub_clear_task(int chunk, int worker, void *arg) {
+    const tss__sub_clearing *c = (const tss__sub_clearing *)arg;
+    const tss_bcsr *A = &c->s->A;
+    uint8_t *live = tss__sub_u(&c->s->live_row);
+    const int dd = c->s->dim * c->s->dim, to = (chunk + 1) * 512 < c->rows ? (chunk + 1) * 512 : c->rows;
+    (void)worker;
+    for (int r = chunk * 512; r < to; r++) {
+        int first = r;
+        for (; r < to && live[r] == TSS__SUB_MARKED; r++) live[r] = TSS__SUB_LIVE;
+        memset(A->val + A->row[first] * dd, 0, (size_t)(A->row[r] - A->row[first]) * (size_t)dd * sizeof(double));
+    }
+}
+
 // Clears the rows of A that the chosen stencils touch for the first time.
 static void tss__sub_open_rows(tss_subspace *s, const tss_unknowns *u, const tss_energy_view *v, const uint8_t *want) {
-    const int A = v->def->arity, dd = s->dim * s->dim;
+    const int A = v->def->arity;
     uint8_t *live = tss__sub_u(&s->live_row);
     for (int k = 0; k < v->list.count; k++) {
         if (want && !want[k]) continue;
         for (int i = k * A; i < (k + 1) * A; i++) {
             int r = v->list.node[i] < 0 ? -1 : u->row[v->list.node[i]];
             if (r < 0 || live[r]) continue;
-            live[r] = TSS__SUB_LIVE;
-            memset(s->A.val + s->A.row[r] * dd, 0, (size_t)(s->A.row[r + 1] - s->A.row[r]) * (size_t)dd * sizeof(double));
+            live[r] = TSS__SUB_MARKED;
         }
     }
+    tss__sub_clearing c = {s, u->rows};
+    tss__parallel_even(&s->host, (u->rows + 511) / 512, tss__sub_clear_task, &c);
 }
 
 // ‖Σ α d‖∞ in tolerances within which A is not summed anew. 10 to 80 took the same iterates in
@@ -4749,10 +4769,19 @@ static double tss__sub_pcg_work(const tss_subspace *s) {
     return TSS__SUB_PCG_FLOP * (2.0 * blocks * s->dim * s->dim + jwork + 20.0 * s->xrows * s->dim);
 }
 
-// Less work than any direct solve of this size needs: spares the analysis where PCG is far ahead.
+// Dense work of the complement H_q − JᵀH_x⁻¹J: `nonzeros` of L pass for each of its columns.
+static double tss__sub_complement_work(const tss_subspace *s, double nonzeros) {
+    double width = 0;
+    for (int k = 0; k < s->modal_count; k++) width += tss__sub_modal(s, k)->thin_rank;
+    if (s->borders == 0) width = 0;
+    return 16.0 * nonzeros * (1 + width) + 4.0 * s->xrows * s->dim * width * width + width * width * width;
+}
+
+// Less work than any direct solve of this size needs: spares the analysis (an ordering) where PCG is
+// far ahead. L has the nonzeros of half of H_x at least.
 static double tss__sub_direct_floor(const tss_subspace *s) {
-    double n = (double)s->xrows * s->dim;
-    return s->dim == 3 ? 5 * n * n : 5 * n * sqrt(n);
+    double n = (double)s->xrows * s->dim, blocks = (double)s->Ax.row[s->xrows];
+    return (s->dim == 3 ? 5 * n * n : 5 * n * sqrt(n)) + tss__sub_complement_work(s, blocks * s->dim * s->dim / 2);
 }
 
 // Work of a direct solve, in dense flops: the triangular solves with many right-hand sides run at a
@@ -4763,14 +4792,10 @@ static tss_result tss__sub_analyze_x(tss_subspace *s, double *direct) {
         if (tss_chol_create(&s->host, &d, &s->chol_x) != TSS_OK) return tss__sub_no_memory(s);
     }
     tss_chol_info info;
-    double width = 0;
     tss_result r = tss_chol_analyze(s->chol_x, &s->Ax, &s->Cx);
     if (r != TSS_OK) return tss_world_fail(s->w, r, "subspace: H_x: %s", tss_result_text(r));
     tss_chol_get_info(s->chol_x, &info);
-    for (int k = 0; k < s->modal_count; k++) width += tss__sub_modal(s, k)->thin_rank;
-    if (s->borders == 0) width = 0;
-    *direct = info.flops + 16.0 * (double)info.nonzeros * (1 + width) + 4.0 * s->xrows * s->dim * width * width +
-              width * width * width;
+    *direct = info.flops + tss__sub_complement_work(s, (double)info.nonzeros);
     return TSS_OK;
 }
 
@@ -4914,7 +4939,7 @@ static tss_result tss__sub_solve_enriched(tss_subspace *s, const tss_unknowns *u
         double iteration = tss__sub_pcg_work(s);
         direct = tss__sub_direct_floor(s);
         // PCG with room to spare needs no analysis of the other.
-        analyzed = !(s->pcg_iterations > 0 && direct > 2 * iteration * s->pcg_iterations && s->pcg_rest == 0);
+        analyzed = !(direct > 2 * iteration * s->pcg_iterations && s->pcg_rest == 0);
         if (analyzed && (r = tss__sub_analyze_x(s, &direct)) != TSS_OK) return r;
         double affordable = direct / iteration;
         if (affordable > s->pcg_iterations && s->pcg_rest == 0)
