@@ -5648,6 +5648,15 @@ static void tss__sub_accepted(void *user, const tss_ctx *c, const double *x0, co
     }
 }
 
+// The room of a secant that has not begun: its pages are there when the first step asks for them.
+static void tss__sub_touch_task(int p, int worker, void *arg) {
+    tss_subspace *s = (tss_subspace *)arg;
+    const tss__sub_part *t = tss__sub_parts(s, p);
+    size_t a = (size_t)tss__sub_modal(s, t->modal)->a;
+    (void)worker;
+    if (!t->fresh) memset(tss__sub_f(&s->secant) + t->h, 0, a * a * sizeof(double));
+}
+
 // Tables, and the modes unless they wait for a refresh callback.
 static tss_result tss__sub_prepare(void *user, tss_world *w, const tss_ctx *c) {
     tss_subspace *s = (tss_subspace *)user;
@@ -5658,7 +5667,9 @@ static tss_result tss__sub_prepare(void *user, tss_world *w, const tss_ctx *c) {
     tss_result r = tss__sub_build(s, c, &u);
     for (int k = 0; k < s->basis_count; k++)
         if (tss__sub_base(s, k)->live && tss__sub_base(s, k)->def.refresh) return r;
-    return r == TSS_OK ? tss__sub_refresh(s, &s->modes) : r;
+    if (r == TSS_OK) r = tss__sub_refresh(s, &s->modes);
+    if (r == TSS_OK) tss_parallel(&s->host, s->groups, tss__sub_touch_task, s);
+    return r;
 }
 
 // Columns of CUSTOM bases for the step to come.

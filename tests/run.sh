@@ -104,11 +104,11 @@ scene_alone() {
         >"$log/alone_$name.build" 2>&1 && [ ! -s "$log/alone_$name.build" ] ||
         { bad "scene $name alone does not build without a warning" "$log/alone_$name.build"; return; }
     for b in "$build" "$build/alone_$name"; do
-        "$b/tss" run "$1" --steps "$2" -o "$build/scene_out" 2>/dev/null | grep '^state ' >"$b/state_$name"
+        "$b/tss" run "$1" --steps "$2" -o "$build/scene_out_$part" 2>/dev/null | grep '^state ' >"$b/state_$name"
     done
     if [ -s "$build/state_$name" ] && cmp -s "$build/state_$name" "$build/alone_$name/state_$name"
     then ok "scene $name alone: the same state with $defs"; else bad "scene $name alone: another state"; fi
-    if "$build/alone_$name/tss" run "$1" --set bodies.0.material.kind=stvk --steps 1 -o "$build/scene_out" \
+    if "$build/alone_$name/tss" run "$1" --set bodies.0.material.kind=stvk --steps 1 -o "$build/scene_out_$part" \
         >"$log/refused_$name.log" 2>&1 || ! grep -q "left out of this build by TSS_NO_MATERIALS" "$log/refused_$name.log"
     then bad "scene $name alone: stvk is not refused" "$log/refused_$name.log"; else ok "scene $name alone refuses stvk"; fi
 }
@@ -175,7 +175,7 @@ fuzz() {
 # Scenes from start to end under the independent checker: no intersection, no inversion, targets met.
 scenes() {
     for s in tests/data/*.json; do
-        [ -f "$s" ] && check "scene $(basename "$s" .json)" "$build/tss" run "$s" -o "$build/scene_out" --check
+        [ -f "$s" ] && check "scene $(basename "$s" .json)" "$build/tss" run "$s" -o "$build/scene_out_$part" --check
     done
     [ -d "$data/ipc/scenes" ] || return 0
     for s in 10_tetTet 10_cubeStack 12_largeMassRatio sqp_04_pointTriangle sqp_05_edgeEdge sqp_09_tetCube \
@@ -185,7 +185,7 @@ scenes() {
         steps=30
         [ "$s" != rodsTwist_E1e4_dt2 ] || steps=1  # an end turns by 144 degrees a step
         check "scene $s" "$build/tss" run "$data/ipc/scenes/$s.txt" --assets "$data/ipc" --steps $steps \
-            -o "$build/scene_out" --check
+            -o "$build/scene_out_$part" --check
     done
 }
 
@@ -208,9 +208,30 @@ neural() { claims neural; }
 # Stiff and extreme cases, judged on every iterate.
 stability() { claims stability; }
 
-case $part in
-all) unit; checkers; scenes; figures; sweep; stability; neural; nodeps; compat; sanitize ;;
-*) $part ;;
-esac
+# Parts one after the other, each in a process of its own; what they print comes part by part.
+lane() {
+    for p in "$@"; do
+        began=$(date +%s)
+        sh "$0" "$build" "$p" >"$log/part_$p.txt" 2>&1
+        { sed '$d' "$log/part_$p.txt"; echo "        part $p: $(tail -n 1 "$log/part_$p.txt"), $(($(date +%s) - began)) s"; } >"$log/part_$p.out"
+        cat "$log/part_$p.out"
+    done
+}
+
+# Two lanes: half the time goes into compilers, which use one core.
+all() {
+    lane nodeps sanitize compat &
+    lane unit checkers scenes figures sweep stability neural
+    wait
+    for p in unit checkers scenes figures sweep stability neural nodeps compat sanitize; do
+        last=$(tail -n 1 "$log/part_$p.txt")
+        case $last in
+        *" passed, "*" failed") passed=$((passed + ${last%% *})); last=${last#*, }; failed=$((failed + ${last%% *})) ;;
+        *) bad "part $p did not end" "$log/part_$p.txt" ;;
+        esac
+    done
+}
+
+$part
 printf '%d passed, %d failed\n' "$passed" "$failed"
 [ "$failed" = 0 ]
