@@ -87,7 +87,8 @@
                            rotate: degrees, along the axis}, ...] are joined by straight lines
    shape                   {kind, ...}, then the body's scale, rotate, translate
     ball ellipsoid cylinder capsule torus cone koosh roller spikes spring anvil mushroom fist hand
-    peak hull              solids about 1 m across: cells (over 1 m), count, ratio: tss_shapes.h
+    peak hull dinosaur elephant bunny
+                           solids about 1 m across: cells (over 1 m), count, ratio: tss_shapes.h
     box                    lower, upper, cells (each axis), split 5 | 6; grade: last cell's size over
                            the first's, each axis (1)
     terrain                lower, upper, cells; height and wave: of its hills, m
