@@ -72,7 +72,7 @@ TSS_API tss_result tss_shape_implicit(const tss_host *host, tss_shape_field *fie
     X(TSS_SHAPE_PEAK, "peak", 24, 5, 0.08)          \
     X(TSS_SHAPE_HULL, "hull", 40, 0, 0.06)          \
     X(TSS_SHAPE_DINOSAUR, "dinosaur", 40, 0, 0)     \
-    X(TSS_SHAPE_ELEPHANT, "elephant", 40, 0, 0)     \
+    X(TSS_SHAPE_ELEPHANT, "elephant", 38, 0, 0)     \
     X(TSS_SHAPE_BUNNY, "bunny", 32, 0, 0)
 
 typedef enum tss_shape_kind {
@@ -853,7 +853,7 @@ static double tss__field_elephant(const double p[3]) {
         {{0.34, -0.01, 0}, {0.365, -0.17, 0}, 0.055, 0.045, 0.02},
         {{0.365, -0.17, 0}, {0.4, -0.27, 0}, 0.045, 0.04, 0.02},
         {{0.4, -0.27, 0}, {0.46, -0.29, 0}, 0.04, 0.034, 0.02},
-        {{0.24, 0.03, 0.07}, {0.36, -0.08, 0.12}, 0.03, 0.02, 0.015},  // tusk
+        {{0.22, 0.03, 0.08}, {0.33, -0.09, 0.16}, 0.032, 0.022, 0.015},  // tusk
         {{0.03, -0.05, 0.105}, {0.03, -0.4, 0.11}, 0.08, 0.066, 0.04},
         {{-0.26, -0.05, 0.105}, {-0.26, -0.4, 0.11}, 0.082, 0.068, 0.04},
         {{-0.35, 0.08, 0}, {-0.43, -0.04, 0}, 0.03, 0.024, 0.02},  // tail
@@ -861,7 +861,7 @@ static double tss__field_elephant(const double p[3]) {
     double f = tss__field_blend(tss__field_egg(p, middle, half), tss__field_egg(p, skull, round), 0.06);
     f = tss__field_limbs(f, p, limb, (int)(sizeof limb / sizeof *limb));
     // The ear: an upright flap that stands off backwards by 35 degrees, in its own axes.
-    static const double hinge[3] = {0.13, 0.1, 0.2}, flap[3] = {0.13, 0.15, 0.032}, zero[3] = {0, 0, 0};
+    static const double hinge[3] = {0.12, 0.1, 0.225}, flap[3] = {0.125, 0.15, 0.036}, zero[3] = {0, 0, 0};
     double u = p[0] - hinge[0], w = p[2] - hinge[2];
     double q[3] = {0.57 * u - 0.82 * w, p[1] - hinge[1], 0.82 * u + 0.57 * w};
     f = tss__field_blend(f, tss__field_egg(q, zero, flap), 0.03);
@@ -876,16 +876,16 @@ static double tss__field_bunny(const double p[3]) {
                                        {{0.14, 0.07, 0}, {0.14, 0.12, 0.115}},     // head
                                        {{0.235, 0.045, 0}, {0.07, 0.055, 0.065}}};
     static const tss__limb limb[] = {
-        {{0.09, -0.25, 0.075}, {0.17, -0.42, 0.08}, 0.055, 0.048, 0.03},
-        {{-0.1, -0.42, 0.15}, {0.05, -0.425, 0.17}, 0.055, 0.045, 0.03},
+        {{0.1, -0.25, 0.085}, {0.18, -0.42, 0.09}, 0.052, 0.048, 0.03},
+        {{-0.12, -0.42, 0.15}, {0.03, -0.425, 0.18}, 0.055, 0.045, 0.03},
         {{-0.35, -0.28, 0}, {-0.36, -0.27, 0}, 0.075, 0.075, 0.01}};  // tail
     double f = tss__field_egg(p, egg[0][0], egg[0][1]);
     for (int i = 1; i < 5; i++)
         f = tss__field_blend(f, tss__field_egg(p, egg[i][0], egg[i][1]), i == 2 ? 0.02 : 0.05);
     f = tss__field_limbs(f, p, limb, (int)(sizeof limb / sizeof *limb));
-    // The ear: an egg along its own axis, leaning back; dished in front by another.
-    static const double root[3] = {0.03, 0.3, 0.07}, ear[3] = {0.17, 0.034, 0.06}, zero[3] = {0, 0, 0};
-    double u = p[0] - root[0], v = p[1] - root[1], w = p[2] - root[2] - 0.15 * v;
+    // The ear: an egg along its own axis, leaning back and out.
+    static const double root[3] = {0.03, 0.3, 0.09}, ear[3] = {0.17, 0.038, 0.055}, zero[3] = {0, 0, 0};
+    double u = p[0] - root[0], v = p[1] - root[1], w = p[2] - root[2] - 0.25 * v;
     double q[3] = {-0.34 * u + 0.94 * v, 0.94 * u + 0.34 * v, w};
     f = tss__field_blend(f, tss__field_egg(q, zero, ear), 0.03);
     return tss__shape_most(f, -0.45 - p[1]);
