@@ -120,7 +120,7 @@
      .ball                 walks as handles do: {radius, m; center: [[low x, y, z], [high]], m, from low;
                            stiffness: of its penalty, N/m³; margin: m (0)}
      .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
-    .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300)}
+    .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300), scale (false)}
     .train                 vanilla: {steps (20000), batch (64), rate (1e-3), rate_end (1e-5), warmup
                            (0), lambda (1), sigma (1), eps (1e-8), ramp (0)}
     .lipschitz             {steps (5000), weight (1e-3), batch (16), rate (1e-4), rate_end (1e-6),
@@ -258,7 +258,7 @@ typedef struct scene_neural {
     } script;
     struct {
         double tol;
-        int most;
+        int most, scale;
     } pca;
     struct {
         int steps, batch, warmup, ramp;
@@ -1841,7 +1841,8 @@ static const scene__key scene__script_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, script.validate, "validate"),
     SCENE__END};
 static const scene__key scene__pca_keys[] = {
-    SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000), SCENE__END};
+    SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000),
+    SCENE__OF(SCENE__FLAG, scene_neural, pca.scale, "scale"), SCENE__END};
 static const scene__key scene__train_keys[] = {
     SCENE__INT(scene_neural, train.steps, "steps", 1, 1e9),
     SCENE__INT(scene_neural, train.batch, "batch", 2, 1e5),
