@@ -2403,14 +2403,17 @@ static void tss__jacobi_dense(int n, int p, int q, double *A, double *Q) {
 
 // Nearest PSD matrix to symmetric A, n <= 12, by cyclic Jacobi.
 static void tss__clamp_dense(int n, double *A) {
-    double Q[144], T[144], off = 1, all = 0;
+    double Q[144], T[144], all = 0;
     for (int i = 0; i < n * n; i++) Q[i] = i % (n + 1) ? 0 : 1, T[i] = A[i], all += A[i] * A[i];
-    for (int sweep = 0; sweep < 12 && off > 1e-34 * all; sweep++) {
+    // what is within the rounding of A is left where it is
+    for (int sweep = 0, turns = 1; sweep < 12 && turns > 0; sweep++) {
+        turns = 0;
         for (int p = 0; p < n; p++)
-            for (int q = p + 1; q < n; q++) tss__jacobi_dense(n, p, q, T, Q);
-        off = 0;
-        for (int i = 0; i < n; i++)
-            for (int j = 0; j < i; j++) off += T[i * n + j] * T[i * n + j];
+            for (int q = p + 1; q < n; q++)
+                if (T[p * n + q] * T[p * n + q] > 1e-31 * all) {
+                    tss__jacobi_dense(n, p, q, T, Q);
+                    turns++;
+                }
     }
     for (int i = 0; i < n; i++)
         for (int j = 0; j <= i; j++) {
@@ -2421,20 +2424,94 @@ static void tss__clamp_dense(int n, double *A) {
         }
 }
 
-// H = vol Gᵀ C G, G the constant map from node positions to F.
+// out_abcd = Σ_m R_ma in_mbcd, ... for each index of a 3 × 3 × 3 × 3 tensor in turn: R of indices 0
+// and 2 is U, of 1 and 3 is V; back: their transposes.
+static void tss__turn_tensor(const double *U, const double *V, int back, double *C) {
+    double T[81];
+    for (int axis = 0; axis < 4; axis++) {
+        const double *R = axis & 1 ? V : U;
+        // indices are turned round: what is summed is always the first, and goes last
+        for (int j = 0; j < 27; j++)
+            for (int a = 0; a < 3; a++) {
+                double s = 0;
+                for (int m = 0; m < 3; m++) s += R[back ? 3 * a + m : 3 * m + a] * C[27 * m + j];
+                T[3 * j + a] = s;
+            }
+        memcpy(C, T, sizeof T);
+    }
+}
+
+// Orthogonal U, V (by columns) with F = U diag V ᵀ to rounding, or nearly so if F is nearly singular.
+static void tss__principal_axes(const double *F, double *U, double *V) {
+    double S[9];
+    for (int i = 0; i < 9; i++) {
+        V[i] = i % 4 ? 0 : 1, S[i] = 0;
+        for (int m = 0; m < 3; m++) S[i] += F[3 * m + i / 3] * F[3 * m + i % 3];
+    }
+    for (int sweep = 0; sweep < 6; sweep++)
+        for (int p = 0; p < 3; p++)
+            for (int q = p + 1; q < 3; q++)
+                if (fabs(S[3 * p + q]) > 1e-17 * (S[0] + S[4] + S[8]))
+                    tss__jacobi_dense(3, p, q, S, V);
+    // columns of F V made orthonormal, the longest first; what has no length takes any direction
+    int order[3] = {0, 1, 2};
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 2; j++)
+            if (S[4 * order[j]] < S[4 * order[j + 1]]) {
+                const int t = order[j];
+                order[j] = order[j + 1], order[j + 1] = t;
+            }
+    for (int k = 0; k < 3; k++) {
+        double u[3], most = 0;
+        for (int attempt = -1; attempt < 3 && !(most > 0); attempt++) {
+            double norm = 0, size = attempt < 0 ? sqrt(S[0] + S[4] + S[8]) : 1;
+            for (int i = 0; i < 3; i++) {
+                u[i] = attempt == i;
+                for (int m = 0; m < 3 && attempt < 0; m++) u[i] += F[3 * i + m] * V[3 * m + order[k]];
+            }
+            for (int pass = 0; pass < 2; pass++)
+                for (int j = 0; j < k; j++) {
+                    double dot = 0;
+                    for (int i = 0; i < 3; i++) dot += u[i] * U[3 * i + order[j]];
+                    for (int i = 0; i < 3; i++) u[i] -= dot * U[3 * i + order[j]];
+                }
+            for (int i = 0; i < 3; i++) norm += u[i] * u[i];
+            if (sqrt(norm) > (attempt < 0 ? 1e-8 : 0.5) * size && norm < HUGE_VAL) most = sqrt(norm);
+        }
+        for (int i = 0; i < 3; i++) U[3 * i + order[k]] = most > 0 ? u[i] / most : i == order[k];
+    }
+}
+
+// C to the nearest PSD matrix. Orthogonal changes of basis alter nothing of that, and between F's
+// principal axes an isotropic density has but one 3 × 3 and three 2 × 2 blocks: Jacobi then has next
+// to nothing left to do (5 times faster in all). Any other density is as right, for a little more.
+static void tss__custom_clamp(int d, const double *F, double *C) {
+    double U[9], V[9];
+    if (d == 3) {
+        tss__principal_axes(F, U, V);
+        tss__turn_tensor(U, V, 0, C);
+    }
+    tss__clamp_dense(d * d, C);
+    if (d == 3) tss__turn_tensor(U, V, 1, C);
+}
+
+// H = vol Gᵀ C G, G the constant map from node positions to F: C G first.
 static void tss__custom_node_blocks(int d, const double *N, double vol, const double *C,
                                     double *out) {
     const int a = d + 1, n = a * d, dd = d * d;
-    for (int i = 0; i < a; i++)
-        for (int j = i; j < a; j++)
-            for (int r = 0; r < d; r++)
-                for (int c = 0; c < d; c++) {
-                    double s = 0;
-                    for (int m = 0; m < d; m++)
-                        for (int k = 0; k < d; k++)
-                            s += N[i * d + m] * C[(r * d + m) * dd + c * d + k] * N[j * d + k];
-                    out[(i * d + r) * n + j * d + c] = out[(j * d + c) * n + i * d + r] = vol * s;
-                }
+    double CG[108];
+    for (int i = 0; i < dd; i++)
+        for (int j = 0; j < n; j++) {
+            double s = 0;
+            for (int k = 0; k < d; k++) s += C[i * dd + j % d * d + k] * N[j / d * d + k];
+            CG[i * n + j] = vol * s;
+        }
+    for (int i = 0; i < n; i++)
+        for (int j = i; j < n; j++) {
+            double s = 0;
+            for (int m = 0; m < d; m++) s += N[i / d * d + m] * CG[(i % d * d + m) * n + j];
+            out[i * n + j] = out[j * n + i] = s;
+        }
 }
 
 static void tss__custom_hessian(const tss__elastic *e, const double *x, tss_ids ids, int psd,
@@ -2449,7 +2526,7 @@ static void tss__custom_hessian(const tss__elastic *e, const double *x, tss_ids 
             e->material.density(e->material.user, d, 1, b.cell + k, F, NULL, NULL, C);
         else
             tss__custom_differences(e, b.cell[k], F, C);
-        if (psd) tss__clamp_dense(dd, C);
+        if (psd) tss__custom_clamp(d, F, C);
         tss__shape_gradients(e, b.cell[k], N);
         tss__custom_node_blocks(d, N, tss__vol_of(e, b.cell[k]), C, out + k * n * n);
     }

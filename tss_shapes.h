@@ -70,7 +70,10 @@ TSS_API tss_result tss_shape_implicit(const tss_host *host, tss_shape_field *fie
     X(TSS_SHAPE_FIST, "fist", 24, 0, 0)             \
     X(TSS_SHAPE_HAND, "hand", 40, 0, 0)             \
     X(TSS_SHAPE_PEAK, "peak", 24, 5, 0.08)          \
-    X(TSS_SHAPE_HULL, "hull", 40, 0, 0.06)
+    X(TSS_SHAPE_HULL, "hull", 40, 0, 0.06)          \
+    X(TSS_SHAPE_DINOSAUR, "dinosaur", 40, 0, 0)     \
+    X(TSS_SHAPE_ELEPHANT, "elephant", 38, 0, 0)     \
+    X(TSS_SHAPE_BUNNY, "bunny", 32, 0, 0)
 
 typedef enum tss_shape_kind {
 #define TSS__ENUM(id, name, cells, count, ratio) id,
@@ -798,6 +801,96 @@ static double tss__field_cone(const double p[3], double ratio) {
     return tss__shape_most(slant / sqrt(1 + ratio * ratio), -0.5 - p[1]);
 }
 
+// Animals look along x and are symmetric in z: p with |z|.
+
+typedef struct tss__limb {
+    double a[3], b[3], ra, rb;  // of a stick
+    double blend;               // with what was there before
+} tss__limb;
+
+static double tss__field_limbs(double f, const double p[3], const tss__limb *limb, int limbs) {
+    for (int i = 0; i < limbs; i++) {
+        const tss__limb *l = &limb[i];
+        f = tss__field_blend(f, tss__field_stick(p, l->a, l->b, l->ra, l->rb), l->blend);
+    }
+    return f;
+}
+
+// Nearly a distance: k0 (k0 - 1) / ‖∇k0²/2‖ with k0² the sum of squares of coordinates over radii.
+static double tss__field_egg(const double p[3], const double center[3], const double radius[3]) {
+    double k0 = 0, k1 = 0;
+    for (int c = 0; c < 3; c++) {
+        double u = (p[c] - center[c]) / radius[c];
+        k0 += u * u;
+        k1 += u * u / (radius[c] * radius[c]);
+    }
+    k0 = sqrt(k0);
+    return k1 > 1e-18 ? k0 * (k0 - 1) / sqrt(k1) : -radius[0];
+}
+
+// A sauropod: four legs, a long neck and a longer tail.
+static double tss__field_dinosaur(const double p[3]) {
+    static const double middle[3] = {-0.01, -0.08, 0}, half[3] = {0.18, 0.125, 0.105};
+    static const tss__limb limb[] = {
+        {{0.1, -0.04, 0}, {0.235, 0.07, 0}, 0.08, 0.052, 0.06},
+        {{0.235, 0.07, 0}, {0.32, 0.26, 0}, 0.052, 0.038, 0.03},
+        {{0.32, 0.285, 0}, {0.43, 0.25, 0}, 0.048, 0.034, 0.03},  // head
+        {{-0.13, -0.07, 0}, {-0.28, -0.14, 0}, 0.085, 0.05, 0.06},
+        {{-0.28, -0.14, 0}, {-0.39, -0.13, 0}, 0.05, 0.035, 0.03},
+        {{-0.39, -0.13, 0}, {-0.475, -0.04, 0}, 0.035, 0.024, 0.02},
+        {{0.08, -0.12, 0.075}, {0.09, -0.34, 0.085}, 0.053, 0.044, 0.03},
+        {{-0.1, -0.12, 0.08}, {-0.1, -0.34, 0.085}, 0.06, 0.046, 0.03}};
+    double f = tss__field_egg(p, middle, half);
+    f = tss__field_limbs(f, p, limb, (int)(sizeof limb / sizeof *limb));
+    return tss__shape_most(f, -0.36 - p[1]);  // flat soles
+}
+
+static double tss__field_elephant(const double p[3]) {
+    static const double middle[3] = {-0.12, 0.03, 0}, half[3] = {0.25, 0.19, 0.165};
+    static const double skull[3] = {0.18, 0.12, 0}, round[3] = {0.125, 0.135, 0.11};
+    static const tss__limb limb[] = {
+        {{0.25, 0.1, 0}, {0.34, -0.01, 0}, 0.075, 0.055, 0.04},  // trunk
+        {{0.34, -0.01, 0}, {0.365, -0.17, 0}, 0.055, 0.045, 0.02},
+        {{0.365, -0.17, 0}, {0.4, -0.27, 0}, 0.045, 0.04, 0.02},
+        {{0.4, -0.27, 0}, {0.46, -0.29, 0}, 0.04, 0.034, 0.02},
+        {{0.22, 0.03, 0.08}, {0.33, -0.09, 0.16}, 0.032, 0.022, 0.015},  // tusk
+        {{0.03, -0.05, 0.105}, {0.03, -0.4, 0.11}, 0.08, 0.066, 0.04},
+        {{-0.26, -0.05, 0.105}, {-0.26, -0.4, 0.11}, 0.082, 0.068, 0.04},
+        {{-0.35, 0.08, 0}, {-0.43, -0.04, 0}, 0.03, 0.024, 0.02},  // tail
+        {{-0.43, -0.04, 0}, {-0.44, -0.16, 0}, 0.024, 0.03, 0.01}};
+    double f = tss__field_blend(tss__field_egg(p, middle, half), tss__field_egg(p, skull, round), 0.06);
+    f = tss__field_limbs(f, p, limb, (int)(sizeof limb / sizeof *limb));
+    // The ear: an upright flap that stands off backwards by 35 degrees, in its own axes.
+    static const double hinge[3] = {0.12, 0.1, 0.225}, flap[3] = {0.125, 0.15, 0.036}, zero[3] = {0, 0, 0};
+    double u = p[0] - hinge[0], w = p[2] - hinge[2];
+    double q[3] = {0.57 * u - 0.82 * w, p[1] - hinge[1], 0.82 * u + 0.57 * w};
+    f = tss__field_blend(f, tss__field_egg(q, zero, flap), 0.03);
+    return tss__shape_most(f, -0.44 - p[1]);
+}
+
+// Sitting, ears up.
+static double tss__field_bunny(const double p[3]) {
+    static const double egg[][2][3] = {{{-0.1, -0.22, 0}, {0.23, 0.21, 0.18}},
+                                       {{0.06, -0.15, 0}, {0.13, 0.17, 0.12}},     // chest
+                                       {{-0.1, -0.3, 0.13}, {0.15, 0.13, 0.075}},  // haunch
+                                       {{0.14, 0.07, 0}, {0.14, 0.12, 0.115}},     // head
+                                       {{0.235, 0.045, 0}, {0.07, 0.055, 0.065}}};
+    static const tss__limb limb[] = {
+        {{0.1, -0.25, 0.085}, {0.18, -0.42, 0.09}, 0.052, 0.048, 0.03},
+        {{-0.12, -0.42, 0.15}, {0.03, -0.425, 0.18}, 0.055, 0.045, 0.03},
+        {{-0.35, -0.28, 0}, {-0.36, -0.27, 0}, 0.075, 0.075, 0.01}};  // tail
+    double f = tss__field_egg(p, egg[0][0], egg[0][1]);
+    for (int i = 1; i < 5; i++)
+        f = tss__field_blend(f, tss__field_egg(p, egg[i][0], egg[i][1]), i == 2 ? 0.02 : 0.05);
+    f = tss__field_limbs(f, p, limb, (int)(sizeof limb / sizeof *limb));
+    // The ear: an egg along its own axis, leaning back and out.
+    static const double root[3] = {0.03, 0.3, 0.09}, ear[3] = {0.17, 0.038, 0.055}, zero[3] = {0, 0, 0};
+    double u = p[0] - root[0], v = p[1] - root[1], w = p[2] - root[2] - 0.25 * v;
+    double q[3] = {-0.34 * u + 0.94 * v, 0.94 * u + 0.34 * v, w};
+    f = tss__field_blend(f, tss__field_egg(q, zero, ear), 0.03);
+    return tss__shape_most(f, -0.45 - p[1]);
+}
+
 static double tss__field_of(const double p[3], void *ctx) {
     const tss_shape_def *d = (const tss_shape_def *)ctx;
     double x = p[0], y = p[1], z = p[2], r = d->ratio;
@@ -838,6 +931,14 @@ static double tss__field_of(const double p[3], void *ctx) {
             return tss__field_peak(p, d);
         case TSS_SHAPE_HULL:
             return tss__field_hull(p, d);
+        case TSS_SHAPE_DINOSAUR:
+        case TSS_SHAPE_ELEPHANT:
+        case TSS_SHAPE_BUNNY: {
+            const double half[3] = {x, y, fabs(z)};
+            return d->kind == TSS_SHAPE_DINOSAUR ? tss__field_dinosaur(half)
+                   : d->kind == TSS_SHAPE_ELEPHANT ? tss__field_elephant(half)
+                                                   : tss__field_bunny(half);
+        }
         case TSS_SHAPE_COUNT:
             break;
     }

@@ -59,8 +59,9 @@ typedef struct neural {
     double *train, *test;
     int trains, tests;
     // x = x0 + B c, c = Aᵀ(x − x0): n × p, row-major. code: of the training frames, trains × p.
+    // D: the decoder's last map, B diag(unit). unit: 1, or with pca.scale the root mean square of c's.
     int p;
-    double *B, *A, *code, *code_test;
+    double *B, *A, *D, *unit, *code, *code_test;
     double *before;  // n: full space one step ago, for a first guess of the next
     double left;    // largest distance of a node in what B misses, over size
     double deadline;  // of now()
@@ -394,7 +395,7 @@ static void neural_close(neural *v) {
     free(v->X), free(v->x0), free(v->mass), free(v->cell), free(v->held), free(v->handle), free(v->pin), free(v->before);
     for (int k = 0; v->one && k < v->cells; k++) tss_elements_destroy(v->one[k]);
     free(v->one), free(v->area), free(v->every);
-    free(v->train), free(v->test), free(v->B), free(v->A), free(v->code), free(v->code_test);
+    free(v->train), free(v->test), free(v->B), free(v->A), free(v->D), free(v->unit), free(v->code), free(v->code_test);
     tss_elements_destroy(v->elements), tss_elements_destroy(v->cubature), tss_work_destroy(v->work);
 }
 
@@ -719,6 +720,19 @@ static double *neural_encode_frames(const neural *v, const double *x, int count)
     return c;
 }
 
+// What the decoder's MLP gives is multiplied by this: with one unit for all modes, each error of a
+// weight moves the stiffest modes, which hardly occur, as far as the softest (neural.md, pca.scale).
+static void neural_units(neural *v) {
+    v->unit = (double *)need((size_t)v->p, sizeof(double));
+    v->D = (double *)need((size_t)v->n * (size_t)v->p, sizeof(double));
+    for (int k = 0; k < v->p; k++) {
+        double s = 0;
+        for (int f = 0; f < v->trains; f++) s += pow(v->code[(size_t)f * (size_t)v->p + (size_t)k], 2) / v->trains;
+        v->unit[k] = v->d->pca.scale && s > 0 ? sqrt(s) : 1;
+    }
+    for (size_t i = 0; i < (size_t)v->n * (size_t)v->p; i++) v->D[i] = v->B[i] * v->unit[i % (size_t)v->p];
+}
+
 // u (modes × n) → B and A, with the unit in which frames have a mean square of 1.
 static void neural_basis_take(neural *v, const double *u) {
     double s = 0;
@@ -771,6 +785,7 @@ static int neural_basis(neural *v) {
     if (v->p < v->d->r)
         return fail(v->r, "%s: the frames span %d modes, expected at least neural.r (%d)", v->r->o.scene, v->p, v->d->r);
     v->code = neural_encode_frames(v, v->train, v->trains), v->code_test = neural_encode_frames(v, v->test, v->tests);
+    neural_units(v);
     printf("basis: %d modes of %d frames, farthest node %.3g of the size, %.1f s\n", v->p, v->trains, v->left, now(NULL) - began);
     return 1;
 }
@@ -809,7 +824,7 @@ static int neural_fresh(neural *v, tss_model *m) {
         free(index);
         return ok;
     }
-    d.out_matrix = v->B;
+    d.out_matrix = v->D;
     if (!neural_net(v, v->d->r, v->p, seed, &d, &m->decoder)) return 0;
     d = tss_net_def_default();
     d.inputs = v->n, d.in_base = v->x0, d.in_matrix = v->A;
@@ -1053,7 +1068,13 @@ static int neural_trainer_supervised(neural_trainer *t) {
     neural *v = t->v;
     tss_net_def plain = tss_net_def_default();
     size_t r = (size_t)v->d->r, p = (size_t)v->p, batch = (size_t)v->d->lipschitz.batch;
-    if (!neural_net(v, v->d->r, v->p, 0, &plain, &t->decoder) || !neural_net(v, v->p, v->d->r, 0, &plain, &t->encoder)) return 0;
+    double *unit = (double *)need(p * p, sizeof *unit);
+    tss_net_def scaled = plain;
+    for (size_t k = 0; k < p; k++) unit[(p + 1) * k] = v->unit[k];
+    if (v->d->pca.scale) scaled.outputs = v->p, scaled.out_matrix = unit;
+    int ok = neural_net(v, v->d->r, v->p, 0, &scaled, &t->decoder) && neural_net(v, v->p, v->d->r, 0, &plain, &t->encoder);
+    free(unit);
+    if (!ok) return 0;
     neural_sync(t);
     t->g = (double *)need(neural_parameters(t->decoder) + neural_parameters(t->encoder), sizeof(double));
     t->c = (double *)need((size_t)v->d->train.batch * p, sizeof(double)), t->c2 = (double *)need(batch * p, sizeof(double));

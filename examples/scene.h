@@ -87,7 +87,8 @@
                            rotate: degrees, along the axis}, ...] are joined by straight lines
    shape                   {kind, ...}, then the body's scale, rotate, translate
     ball ellipsoid cylinder capsule torus cone koosh roller spikes spring anvil mushroom fist hand
-    peak hull              solids about 1 m across: cells (over 1 m), count, ratio: tss_shapes.h
+    peak hull dinosaur elephant bunny
+                           solids about 1 m across: cells (over 1 m), count, ratio: tss_shapes.h
     box                    lower, upper, cells (each axis), split 5 | 6; grade: last cell's size over
                            the first's, each axis (1)
     terrain                lower, upper, cells; height and wave: of its hills, m
@@ -119,7 +120,7 @@
      .ball                 walks as handles do: {radius, m; center: [[low x, y, z], [high]], m, from low;
                            stiffness: of its penalty, N/m³; margin: m (0)}
      .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
-    .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300)}
+    .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300), scale (false)}
     .train                 vanilla: {steps (20000), batch (64), rate (1e-3), rate_end (1e-5), warmup
                            (0), lambda (1), sigma (1), eps (1e-8), ramp (0)}
     .lipschitz             {steps (5000), weight (1e-3), batch (16), rate (1e-4), rate_end (1e-6),
@@ -257,7 +258,7 @@ typedef struct scene_neural {
     } script;
     struct {
         double tol;
-        int most;
+        int most, scale;
     } pca;
     struct {
         int steps, batch, warmup, ramp;
@@ -1840,7 +1841,8 @@ static const scene__key scene__script_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, script.validate, "validate"),
     SCENE__END};
 static const scene__key scene__pca_keys[] = {
-    SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000), SCENE__END};
+    SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000),
+    SCENE__OF(SCENE__FLAG, scene_neural, pca.scale, "scale"), SCENE__END};
 static const scene__key scene__train_keys[] = {
     SCENE__INT(scene_neural, train.steps, "steps", 1, 1e9),
     SCENE__INT(scene_neural, train.batch, "batch", 2, 1e5),

@@ -30,6 +30,10 @@ claim "neural: goes on where it stopped" \
 for f in frames.bin base_0.tssn vanilla_0.tssn lipschitz_0.tssn; do
     claim "neural: the same bits after stops: $f" 'cmp -s "$out/a/$f" "$out/b/$f"'
 done
+# pca.scale: at the start a decoder of one unit for all modes is far rougher.
+lip() { awk -F, '$1 == "base" {print $6; exit}' "$out/$1/train_0.csv"; }
+claim "neural: modes in units of their own" 'tss train "$out/scaled" --set neural.pca.scale=true --method vanilla >"$build/neural_scaled.log" 2>&1 &&
+    less "$(lip scaled)" "$(lip a)"'
 claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
     "$build/tss" neural evaluate examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \

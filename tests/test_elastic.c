@@ -857,6 +857,30 @@ static void test_custom(void **unused) {
         }
 }
 
+// Clamping between F's principal axes is clamping: any symmetric C, and F at rest but for rounding
+// (all axes alike), turned, flat, a line, nothing, inverted.
+static void test_custom_clamp(void **unused) {
+    (void)unused;
+    const double turned[9] = {0, -1, 0, 1, 0, 0, 0, 0, 1};
+    for (int kind = 0; kind < 7; kind++)
+        for (int trial = 0; trial < 20; trial++) {
+            double F[9], C[81], D[81], most = 0, size = 0;
+            for (int i = 0; i < 9; i++) {
+                double u = uniform(-1, 1), one = i % 4 == 0;
+                F[i] = kind == 0 ? one + 1e-16 * u : kind == 1 ? turned[i] * (1 + 1e-9 * u)
+                       : kind == 2 ? (i / 3 < 2) * u : kind == 3 ? (i / 3 == 1) * u
+                       : kind == 4 ? 0 : kind == 5 ? one * (i == 4 ? -1 : 1) : u;
+            }
+            for (int i = 0; i < 9; i++)
+                for (int j = 0; j <= i; j++) C[9 * i + j] = C[9 * j + i] = uniform(-1, 1);
+            memcpy(D, C, sizeof C);
+            tss__clamp_dense(9, C);
+            tss__custom_clamp(3, F, D);
+            for (int i = 0; i < 81; i++) most = fmax(most, fabs(C[i] - D[i])), size = fmax(size, fabs(C[i]));
+            assert_true(most <= 1e-13 * size);
+        }
+}
+
 static void test_per_cell(void **unused) {
     (void)unused;
     double E[CELLS], nu[CELLS], v[CELLS], g[CELLS * 12], w, h[12];
@@ -1249,6 +1273,7 @@ int main(void) {
         cmocka_unit_test(test_lists),      cmocka_unit_test(test_stiff),
         cmocka_unit_test(test_filter),     cmocka_unit_test(test_min_J),
         cmocka_unit_test(test_barrier),    cmocka_unit_test(test_custom),
+        cmocka_unit_test(test_custom_clamp),
         cmocka_unit_test(test_per_cell),   cmocka_unit_test(test_linear_limit),
         cmocka_unit_test(test_errors),     cmocka_unit_test(test_membrane),
         cmocka_unit_test(test_hinge),      cmocka_unit_test(test_spring),
