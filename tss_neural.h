@@ -217,6 +217,12 @@ TSS_API void tss_neural_density(void *user, int dim, int count, const int *cell,
 TSS_API tss_result tss_reduced_potential(const tss_net *decoder, const tss_elements *e,
                                          tss_work *work, int batch, const double *z, double *P,
                                          double *gradient, double *hessian);
+// The same with coordinates that a script moves (below; NULL: none).
+struct tss_held;
+TSS_API tss_result tss_reduced_potential_held(const tss_net *decoder, const tss_elements *e,
+                                              tss_work *work, const struct tss_held *held,
+                                              int batch, const double *z, double *P,
+                                              double *gradient, double *hessian);
 // u ᵀ∇²_z P v of each row (z, u, v: batch × r), by polarisation of one jet.
 TSS_API tss_result tss_reduced_second(const tss_net *decoder, const tss_elements *e, tss_work *work,
                                       int batch, const double *z, const double *u, const double *v,
@@ -360,6 +366,12 @@ typedef struct tss_model {  // start from zeros
 } tss_model;
 TSS_API void tss_model_free(tss_model *m);  // destroys the parts, leaves zeros
 
+// Other coordinates of the same manifold, z = T y (T: r × r, row-major): the decoder becomes
+// y → f(T y), the encoder x → T⁻¹ g(x), by their first and last layer. The decoder has no
+// in_matrix, the encoder no last map. What the optimiser remembers is of the old coordinates: start
+// it anew. Errors: BAD_ARGUMENT (T is singular or not finite), NO_MEMORY; nothing changes then.
+TSS_API tss_result tss_model_change_z(tss_model *m, const double *T);
+
 // Bytes that the model takes; written to data if size suffices (data NULL: the size only; 0: size
 // too small, no decoder, or a number that is not finite: no reader would take it).
 TSS_API size_t tss_model_save(const tss_model *m, void *data, size_t size);
@@ -392,6 +404,10 @@ typedef struct tss_training_def {
     double eps;            // of the logarithm; default 1e-8
     uint64_t ramp;  // unsupervised: steps over which out_scale grows from 0 to 1, and sigma from 0
                     // to itself; default 0: none
+    // Unsupervised: r × r, samples are z = S n with n ~ N(0, 1), and Eq. (4) compares ‖Δf‖ with
+    // σ‖Δn‖: L_C of a model after tss_model_change_z(T) is with S = T⁻¹ what it was. Borrowed;
+    // NULL (default): 1
+    const double *spread;
     double lipschitz_weight;      // λ_LS; default 0: vanilla
     uint64_t lipschitz_from;      // first step with L_LS; default 0
     int lipschitz_batch;          // samples of L_LS, >= 2; default 16
@@ -2420,6 +2436,13 @@ tss_result tss_reduced_potential(const tss_net *n, const tss_elements *e, tss_wo
     return tss__reduced_potential(n, e, w, NULL, batch, z, P, gradient, hessian);
 }
 
+tss_result tss_reduced_potential_held(const tss_net *n, const tss_elements *e, tss_work *w,
+                                      const tss_held *held, int batch, const double *z, double *P,
+                                      double *gradient, double *hessian) {
+    if (!tss__held_fits(held, n)) return TSS_ERROR_BAD_ARGUMENT;
+    return tss__reduced_potential(n, e, w, held, batch, z, P, gradient, hessian);
+}
+
 tss_result tss_reduced_second(const tss_net *n, const tss_elements *e, tss_work *w, int batch,
                               const double *z, const double *u, const double *v, double *out) {
     if (!tss__n_sizes(batch, 2) || !tss__n_fits(n, e)) return TSS_ERROR_BAD_ARGUMENT;
@@ -2516,6 +2539,7 @@ typedef struct tss__n_unsup {
     tss__n_reduced r;
     const double *mass;
     double lambda, sigma2, eps;
+    const double *n;        // batch × r: whose distances the repulsion compares with
     double *P, *repulsion;  // of each sample
 } tss__n_unsup;
 
@@ -2534,11 +2558,11 @@ static void tss__unsup_pair_task(int i, int worker, void *arg) {
     tss__n_unsup *j = (tss__n_unsup *)arg;
     const tss__jetpass *p = &j->r.p;
     size_t n = p->coords, r = (size_t)p->net->width[0];
-    const double *xi = p->x + (size_t)i * n, *zi = j->r.z + (size_t)i * r;
+    const double *xi = p->x + (size_t)i * n, *zi = j->n + (size_t)i * r;
     double *bar = p->xbar + (size_t)i * n, sum = 0;
     double share = 4 * j->lambda / ((double)p->batch * (p->batch - 1));
     for (int o = 0; o < p->batch; o++) {
-        const double *xo = p->x + (size_t)o * n, *zo = j->r.z + (size_t)o * r;
+        const double *xo = p->x + (size_t)o * n, *zo = j->n + (size_t)o * r;
         double df = 0, dz = 0;
         if (o == i) continue;
         for (size_t a = 0; a < n; a++)
@@ -2559,10 +2583,10 @@ static void tss__unsup_backward_task(int c, int worker, void *arg) {
     tss__jetpass_backward(p, c, 0);
 }
 
-tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_work *w,
-                                 const double *mass, double lambda, double sigma, double eps,
-                                 int batch, const double *z, double weight, double *loss,
-                                 double *parts, double *decoder_bar) {
+static tss_result tss__unsupervised(const tss_net *dec, const tss_elements *e, tss_work *w,
+                                    const double *mass, double lambda, double sigma, double eps,
+                                    int batch, const double *z, const double *normal, double weight,
+                                    double *loss, double *parts, double *decoder_bar) {
     if (batch < 2 || !tss__n_sizes(batch, 0) || !tss__n_fits(dec, e) || !(sigma > 0) || !(eps >= 0))
         return TSS_ERROR_BAD_ARGUMENT;
     tss__n_unsup j;
@@ -2575,7 +2599,7 @@ tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_
         j.P = tss__n_take(&s, batch, 1), j.repulsion = tss__n_take(&s, batch, 1);
         if (pass == 0 && !tss__n_room(w, &s)) return TSS_ERROR_NO_MEMORY;
     }
-    j.r.z = z, j.r.P = j.P, j.r.all_alpha = 1.0 / batch;
+    j.r.z = z, j.n = normal, j.r.P = j.P, j.r.all_alpha = 1.0 / batch;
     j.mass = mass, j.lambda = lambda, j.sigma2 = sigma * sigma, j.eps = eps;
     tss_parallel(&w->host, j.r.p.chunks, tss__unsup_forward_task, &j);
     tss_parallel(&w->host, batch, tss__unsup_pair_task, &j);
@@ -2586,6 +2610,14 @@ tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_
     tss_parallel(&w->host, j.r.p.chunks, tss__unsup_backward_task, &j);
     tss__jetpass_collect(&w->host, &j.r.p, weight, decoder_bar);
     return TSS_OK;
+}
+
+tss_result tss_loss_unsupervised(const tss_net *dec, const tss_elements *e, tss_work *w,
+                                 const double *mass, double lambda, double sigma, double eps,
+                                 int batch, const double *z, double weight, double *loss,
+                                 double *parts, double *decoder_bar) {
+    return tss__unsupervised(dec, e, w, mass, lambda, sigma, eps, batch, z, z, weight, loss, parts,
+                             decoder_bar);
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -3538,6 +3570,63 @@ tss_result tss_model_read(const tss_host *host, const char *path, tss_model *out
     return r;
 }
 
+// ---- other coordinates ----------------------------------------------------------------------
+
+// A ← A⁻¹ (r × r) with room for r² more, by Gauss and Jordan with pivots of columns. 0: singular.
+static int tss__n_invert(int r, double *A, double *R) {
+    tss__n_identity(R, r);
+    for (int k = 0; k < r; k++) {
+        int p = k;
+        for (int i = k + 1; i < r; i++)
+            if (fabs(A[i * r + k]) > fabs(A[p * r + k])) p = i;
+        if (!(fabs(A[p * r + k]) > 0) || !isfinite(A[p * r + k])) return 0;
+        for (int j = 0; j < r; j++) {
+            double a = A[p * r + j], b = R[p * r + j];
+            A[p * r + j] = A[k * r + j], A[k * r + j] = a, R[p * r + j] = R[k * r + j], R[k * r + j] = b;
+        }
+        double d = 1 / A[k * r + k];
+        for (int j = 0; j < r; j++) A[k * r + j] *= d, R[k * r + j] *= d;
+        for (int i = 0; i < r; i++) {
+            double f = A[i * r + k];
+            for (int j = 0; j < r && i != k; j++) A[i * r + j] -= f * A[k * r + j], R[i * r + j] -= f * R[k * r + j];
+        }
+    }
+    memcpy(A, R, (size_t)(r * r) * sizeof(double));
+    for (int i = 0; i < r * r; i++)
+        if (!isfinite(A[i])) return 0;
+    return 1;
+}
+
+tss_result tss_model_change_z(tss_model *m, const double *T) {
+    tss_net *dec = m->decoder, *enc = m->encoder;
+    if (!dec || dec->has_in || dec->width[0] > 4096 || (enc && (enc->map != TSS__MAP_NONE || enc->outputs != dec->width[0])))
+        return TSS_ERROR_BAD_ARGUMENT;
+    int r = dec->width[0], w = dec->width[1];
+    size_t rr = (size_t)(r * r), bytes = (2 * rr + (size_t)r) * sizeof(double);
+    double *inverse = (double *)tss_alloc(&dec->host, bytes), *col = inverse + 2 * rr;
+    if (!inverse) return TSS_ERROR_NO_MEMORY;
+    memcpy(inverse, T, rr * sizeof(double));
+    int ok = tss__n_invert(r, inverse, inverse + rr);
+    for (int j = 0; ok && j < w; j++) {  // rows of z: z W = y Tᵀ W
+        for (int a = 0; a < r; a++) col[a] = dec->par[a * w + j];
+        for (int a = 0; a < r; a++) {
+            double s = 0;
+            for (int b = 0; b < r; b++) s += T[b * r + a] * col[b];
+            dec->par[a * w + j] = s;
+        }
+    }
+    double *last = enc ? enc->par + enc->theta[enc->layers - 1] : NULL;
+    for (int i = 0; ok && enc && i <= enc->width[enc->layers - 1]; i++, last += r) {  // b is the last row
+        memcpy(col, last, (size_t)r * sizeof(double));
+        for (int a = 0; a < r; a++) {
+            last[a] = 0;
+            for (int b = 0; b < r; b++) last[a] += inverse[a * r + b] * col[b];
+        }
+    }
+    tss_free(&dec->host, inverse, bytes);
+    return ok ? TSS_OK : TSS_ERROR_BAD_ARGUMENT;
+}
+
 // ---------------------------------------------------------------------------------------------
 // >>training (private)
 // ---------------------------------------------------------------------------------------------
@@ -3658,6 +3747,18 @@ static void tss__training_normals(tss_training *t, double *to, int count) {
         to[i] = tss_rng_normal(&t->def.model->rng);
 }
 
+// Normal samples to t->z_bar, S times them to t->z.
+static void tss__training_samples(tss_training *t, int count) {
+    int r = t->def.model->decoder->inputs;
+    const double *S = t->def.spread;
+    tss__training_normals(t, t->z_bar, count);
+    for (int i = 0; i < count * r; i++) {
+        const double *n = t->z_bar + i - i % r;
+        t->z[i] = S ? 0 : t->z_bar[i];
+        for (int b = 0; S && b < r; b++) t->z[i] += S[i % r * r + b] * n[b];
+    }
+}
+
 static tss_result tss__training_vanilla(tss_training *t, double ramp, tss_training_info *info) {
     const tss_training_def *d = &t->def;
     const tss_model *m = d->model;
@@ -3666,10 +3767,9 @@ static tss_result tss__training_vanilla(tss_training *t, double ramp, tss_traini
         return tss_loss_reconstruction(m->decoder, m->encoder, t->work, d->mass, d->batch, t->x, 1,
                                        &info->loss, t->g, t->g + t->dec);
     }
-    tss__training_normals(t, t->z, d->batch);
-    return tss_loss_unsupervised(m->decoder, d->elements, t->work, d->mass, d->lambda,
-                                 d->sigma * ramp, d->eps, d->batch, t->z, 1, &info->loss,
-                                 info->parts, t->g);
+    tss__training_samples(t, d->batch);
+    return tss__unsupervised(m->decoder, d->elements, t->work, d->mass, d->lambda, d->sigma * ramp,
+                             d->eps, d->batch, t->z, t->z_bar, 1, &info->loss, info->parts, t->g);
 }
 
 // λ_LS L_LS on samples of the pull-back distribution (§4.2): encoded frames, or N(0, 1).
@@ -3690,7 +3790,7 @@ static tss_result tss__training_lipschitz(tss_training *t, tss_training_info *in
             t->held[i] =
                 t->x[(size_t)(i / n) * (size_t)m->decoder->outputs + (size_t)d->held[i % n]];
     } else {
-        tss__training_normals(t, t->z, B);
+        tss__training_samples(t, B);
     }
     if (probe) tss__training_normals(t, probe, 2 * d->lipschitz.probes);
     if (z_bar) tss__n_zero(z_bar, (size_t)(B * r));

@@ -62,6 +62,7 @@ typedef struct neural {
     // D: the decoder's last map, B diag(unit). unit: 1, or with pca.scale the root mean square of c's.
     int p;
     double *B, *A, *D, *unit, *code, *code_test;
+    double *T, *S;   // lipschitz.whiten: z = T y, y = S z; r × r
     double *before;  // n: full space one step ago, for a first guess of the next
     double left;    // largest distance of a node in what B misses, over size
     double deadline;  // of now()
@@ -396,6 +397,7 @@ static void neural_close(neural *v) {
     for (int k = 0; v->one && k < v->cells; k++) tss_elements_destroy(v->one[k]);
     free(v->one), free(v->area), free(v->every);
     free(v->train), free(v->test), free(v->B), free(v->A), free(v->D), free(v->unit), free(v->code), free(v->code_test);
+    free(v->T), free(v->S);
     tss_elements_destroy(v->elements), tss_elements_destroy(v->cubature), tss_work_destroy(v->work);
 }
 
@@ -862,15 +864,22 @@ static int neural_read(neural *v, neural_phase phase, tss_model *m, int *there) 
                 path, v->r->o.scene);
 }
 
-// z of frames (count × n): encoded; unsupervised: N(0, I).
-static double *neural_z(neural *v, const tss_model *m, const double *x, int count) {
+// z of frames (count × n): encoded; unsupervised: N(0, I), times S where z has been whitened.
+static double *neural_z(neural *v, const tss_model *m, neural_phase phase, const double *x, int count) {
+    const double *S = phase == NEURAL_LIPSCHITZ && v->d->lipschitz.whiten ? v->S : NULL;
+    int r = v->d->r;
     double *z = (double *)need((size_t)count * (size_t)v->d->r, sizeof *z);
     tss_rng rng = tss_rng_seed(12345);
     if (m->encoder) {
         (void)tss_net_forward(m->encoder, v->work, count, x, z);
         return z;
     }
-    for (int i = 0; i < count * v->d->r; i++) z[i] = tss_rng_normal(&rng);
+    for (int i = 0; i < count * r; i++) z[i] = tss_rng_normal(&rng);
+    for (int k = 0; S && k < count; k++) {
+        double n[1000];
+        memcpy(n, z + k * r, (size_t)r * sizeof *n);
+        for (int i = 0; i < r * r; i++) z[k * r + i / r] = (i % r ? z[k * r + i / r] : 0) + S[i] * n[i % r];
+    }
     return z;
 }
 
@@ -905,14 +914,14 @@ typedef struct neural_selection {
 } neural_selection;
 
 // At most `most` cells that stand for all of them in the subspace of a model; 0 or all: *out stays.
-static int neural_cubature(neural *v, const tss_model *base, int most, tss_elements **out, neural_selection *s) {
+static int neural_cubature(neural *v, const tss_model *base, neural_phase phase, int most, tss_elements **out, neural_selection *s) {
     const scene_neural *d = v->d;
     double began = now(NULL);
     int ok;
     s->cells = v->cells, s->error = s->seconds = 0;
     if (most == 0 || most >= v->cells) return 1;
     double *x = neural_spread(v, v->train, v->trains, d->lipschitz.samples);
-    double *z = neural_z(v, base, x, d->lipschitz.samples);
+    double *z = neural_z(v, base, phase, x, d->lipschitz.samples);
     int *subset = (int *)need((size_t)most, sizeof *subset);
     double *weight = (double *)need((size_t)most, sizeof *weight);
     tss_cubature_def c = tss_cubature_def_default();
@@ -929,6 +938,74 @@ static int neural_cubature(neural *v, const tss_model *base, int most, tss_eleme
     if (ok) printf("cubature: %d of %d cells, error %.3g, %.1f s\n", s->cells, v->cells, s->error, s->seconds);
     free(x), free(z), free(subset), free(weight), free(value);
     return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_whitening: z = T y, in which the mean of |∇²P| + JᵀMJ/h² over states of the base is the unit
+// matrix (J per unit of y²). The iterations of L-BFGS follow that matrix's condition, which L_LS does not
+// see, and its first line search, from a step of −∇E, follows its size. In y, L_LS weighs a change of the
+// Hessian by the Hessian itself, as the affine-invariant theory of Newton's method does.
+// ---------------------------------------------------------------------------------------------
+
+#define NEURAL_WHITEN_STATES 200
+#define NEURAL_WHITEN_LEAST 1e-6  // of the largest eigenvalue: directions that move nothing stay finite
+
+// The mean over states z (count × r), r × r, symmetric.
+static int neural_mean_hessian(neural *v, const tss_model *m, int count, const double *x, const double *z, double *mean) {
+    int r = v->d->r, rr = r * r;
+    size_t n = (size_t)v->n;
+    double *H = (double *)need((size_t)(2 * rr + 2 * r), sizeof *H), *E = H + rr, *g = E + rr, *P = g + r;
+    double *J = (double *)need((size_t)r * n, sizeof *J), *value = (double *)need((size_t)v->pinned, sizeof *value);
+    double *I = (double *)need((size_t)rr, sizeof *I);
+    tss_held held = {v->pinned, v->pin, value};
+    tss_result e = TSS_OK;
+    memset(mean, 0, (size_t)rr * sizeof *mean);
+    for (int i = 0; i < r; i++) I[i * (r + 1)] = 1;
+    for (int k = 0; k < count && e == TSS_OK; k++) {
+        if (v->pinned) neural_pinned(v, x + (size_t)k * n, 1, value);
+        e = tss_reduced_potential_held(m->decoder, v->elements, v->work, v->pinned ? &held : NULL, 1, z + k * r, P, g, H);
+        neural_jacobi(r, H, E);
+        for (int i = 0; i < r * rr; i++) {
+            int q = i / rr, a = i % rr;
+            mean[a] += fabs(H[q * (r + 1)]) * E[q * r + a / r] * E[q * r + a % r] / count;
+        }
+        if (e == TSS_OK && v->h > 0) e = tss_net_jets(m->decoder, v->work, 1, r, z + k * r, I, NULL, NULL, J, NULL);
+        for (int a = 0; a < rr && v->h > 0; a++)
+            for (size_t j = 0; j < n; j++)
+                mean[a] += v->mass[j] * J[(size_t)(a / r) * n + j] * J[(size_t)(a % r) * n + j] / (v->h * v->h * count);
+    }
+    free(H), free(J), free(value), free(I);
+    return e == TSS_OK ? 1 : fail(v->r, "%s: whiten: %s", v->r->o.scene, tss_result_text(e));
+}
+
+// v->T and v->S from a base, if they are asked for and not there.
+static int neural_whitening(neural *v, const tss_model *base) {
+    int r = v->d->r, count = NEURAL_WHITEN_STATES;
+    size_t rr = (size_t)(r * r);
+    if (!v->d->lipschitz.whiten || v->T) return 1;
+    double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, base, NEURAL_BASE, x, count);
+    double *A = (double *)need(2 * rr, sizeof *A), *E = A + rr, most = 0;
+    if (!neural_mean_hessian(v, base, count, x, z, A)) return 0;
+    v->T = (double *)need(rr, sizeof *v->T), v->S = (double *)need(rr, sizeof *v->S);
+    neural_jacobi(r, A, E);
+    for (int q = 0; q < r; q++) most = fmax(most, A[q * (r + 1)]);
+    for (int q = 0; q < r; q++)
+        for (int i = 0; i < r * r; i++) {
+            double l = sqrt(fmax(A[q * (r + 1)], NEURAL_WHITEN_LEAST * most)), ee = E[q * r + i / r] * E[q * r + i % r];
+            v->T[i] += ee / l, v->S[i] += ee * l;
+        }
+    free(x), free(z), free(A);
+    return 1;
+}
+
+// The whitening, from base_N.tssn.
+static int neural_whitening_read(neural *v) {
+    tss_model base;
+    int there, ok = 1;
+    if (!v->d->lipschitz.whiten || v->T) return 1;
+    if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
+    if (there) ok = neural_whitening(v, &base), tss_model_free(&base);
+    return ok && (there || fail(v->r, "%s/base_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, v->r->o.seed, v->r->o.scene));
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -1094,6 +1171,7 @@ static int neural_trainer_unsupervised(neural_trainer *t) {
     td.ramp = (uint64_t)d->train.ramp, td.lipschitz_from = t->first, td.lipschitz_batch = d->lipschitz.batch;
     td.lipschitz_weight = t->phase == NEURAL_LIPSCHITZ ? d->lipschitz.weight : 0, td.lipschitz = neural_lipschitz(v);
     td.adam = neural_adam(t);
+    if (t->phase == NEURAL_LIPSCHITZ && d->lipschitz.whiten) td.spread = v->S;
     tss_host host = tss_host_default();
     host.log = print_log, host.workers = v->r->o.threads;
     return tss_training_create(&host, &td, &t->t) == TSS_OK ? 1 : fail(v->r, "%s: neural.train: the library refuses it", v->r->o.scene);
@@ -1131,11 +1209,14 @@ static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t)
     t->first = phase == NEURAL_BASE ? 0 : (uint64_t)v->d->train.steps;
     t->last = t->first + (uint64_t)(phase == NEURAL_BASE ? v->d->train.steps : v->d->lipschitz.steps);
     tss_adam_def a = neural_adam(t);
+    if (phase == NEURAL_LIPSCHITZ && !neural_whitening_read(v)) return 0;
     if (!neural_read(v, phase, &t->m, &there)) return 0;
     if (!there && phase == NEURAL_BASE && !neural_fresh(v, &t->m)) return 0;
     if (!there && phase != NEURAL_BASE) {
         if (!neural_read(v, NEURAL_BASE, &t->m, &there)) return 0;
         if (tss_adam_set(t->m.adam, &a, 1) != TSS_OK) return fail(v->r, "%s: neural.lipschitz: bad rates", v->r->o.scene);
+        if (phase == NEURAL_LIPSCHITZ && v->T && tss_model_change_z(&t->m, v->T) != TSS_OK)
+            return fail(v->r, "%s: neural.lipschitz.whiten: the mean Hessian is singular", v->r->o.scene);
     }
     size_t all = neural_parameters(t->m.decoder) + neural_parameters(t->m.encoder);
     if (!t->m.adam && tss_adam_create(NULL, &a, all, &t->m.adam) != TSS_OK) return fail(v->r, "out of memory");
@@ -1155,7 +1236,7 @@ static void neural_trainer_close(neural_trainer *t) {
 static int neural_checkpoint(neural_trainer *t) {
     neural *v = t->v;
     char path[700];
-    double *z = neural_z(v, &t->m, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
+    double *z = neural_z(v, &t->m, t->phase, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     const tss_elements *e = v->cubature ? v->cubature : v->elements;
     (void)neural_eq7(v, &t->m, e, 1, 2, NEURAL_SAMPLES, t->z_test, z, &t->lip);
     fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
@@ -1210,7 +1291,7 @@ static int neural_train(neural *v) {
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
     if (!neural_train_phase(v, NEURAL_BASE) || v->stopped) return !v->r->why.text[0];
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
-    int ok = neural_cubature(v, &base, v->d->lipschitz.cubature, &v->cubature, &chosen);
+    int ok = neural_cubature(v, &base, NEURAL_BASE, v->d->lipschitz.cubature, &v->cubature, &chosen);
     tss_model_free(&base);
     if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
     if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
@@ -1279,7 +1360,8 @@ static int neural_entry_open(neural_trial *t, int which) {
         return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
                     v->r->o.seed, v->r->o.scene);
     neural_selection chosen;
-    if (!neural_cubature(v, &e->m, d->solver.cubature, &e->cells, &chosen)) return 0;
+    if (which == NEURAL_TRIAL_LIPSCHITZ && !neural_whitening_read(v)) return 0;
+    if (!neural_cubature(v, &e->m, which == NEURAL_TRIAL_LIPSCHITZ ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, d->solver.cubature, &e->cells, &chosen)) return 0;
     tss_reduced_def rd = tss_reduced_def_default();
     rd.decoder = e->m.decoder, rd.elements = e->cells ? e->cells : v->elements, rd.mass = v->mass, rd.h = v->h;
     if (v->ball.radius > 0) {
@@ -1314,7 +1396,10 @@ static int neural_trial_open(neural *v, neural_trial *t) {
         if (!ok || v->r->why.text[0]) return 0;
     }
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
-    t->steps = v->d->script.test * (v->d->script.length / v->d->script.stride);
+    t->steps = v->d->script.test * ((v->d->script.length - v->d->script.settle) / v->d->script.stride);
+    if (t->steps < 1)
+        return fail(v->r, "%s: neural.script.settle is %d, expected at least a stride below length (%d)", v->r->o.scene, v->d->script.settle,
+                    v->d->script.length);
     if (v->d->script.stride > v->d->script.length || (v->h > 0 && v->d->script.stride > 1))
         return fail(v->r, "%s: neural.script.stride is %d, expected at most length (%d), and 1 unless quasi-static", v->r->o.scene,
                     v->d->script.stride, v->d->script.length);
@@ -1395,16 +1480,21 @@ typedef int neural_watch(neural_trial *t, int sequence, int k, void *ctx);  // 0
 static int neural_trial_sequence(neural_trial *t, int number, const neural_start *start, neural_watch *watch, void *ctx) {
     neural *v = t->v;
     neural_script s = neural_script_of(v, t->first + number);
-    int ok = load_world(v->r, v->r->w, start->data, start->size);
+    int ok = load_world(v->r, v->r->w, start->data, start->size), stride = v->d->script.stride, settle = v->d->script.settle;
+    tss_step_info first;
+    for (int k = 0; ok && k < settle; k++) ok = neural_full_step(v, &s, k, t->room, &first);
     for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {
         if (!t->e[q].used) continue;
+        const double *from = settle ? tss_world_positions(v->r->w) : v->x0;
         (void)tss_reduced_set_handles(t->e[q].s, 0, NULL, NULL);
-        tss_result r = tss_reduced_project(t->e[q].s, v->x0, NULL);
+        double *z = settle && t->e[q].m.encoder ? neural_z(v, &t->e[q].m, NEURAL_VANILLA, from, 1) : NULL;
+        if (z) (void)tss_reduced_set(t->e[q].s, z);
+        free(z);
+        tss_result r = tss_reduced_project(t->e[q].s, from, NULL);
         if (r != TSS_OK) ok = fail(v->r, "%s: the start cannot be projected: %s", v->r->o.scene, tss_result_text(r));
     }
-    int stride = v->d->script.stride;
-    for (int k = stride - 1; ok && k < s.length; k += stride) {
-        int at = number * (s.length / stride) + k / stride;
+    for (int k = settle + stride - 1; ok && k < s.length; k += stride) {
+        int at = number * ((s.length - settle) / stride) + (k - settle) / stride;
         ok = neural_trial_full(t, &s, k, at);
         neural_targets(v, &s, k, t->target), neural_forces(v, &s, k, 1, t->force);
         for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {  // who is first takes turns
@@ -1479,7 +1569,7 @@ static int neural_project(neural_trial *t, neural_entry *e) {
     for (int f = 0; f < v->tests; f += 4, count++) {
         double mean, most;
         const double *x = v->test + (size_t)f * (size_t)v->n;
-        double *z = e->m.encoder ? neural_z(v, &e->m, x, 1) : NULL;
+        double *z = e->m.encoder ? neural_z(v, &e->m, NEURAL_VANILLA, x, 1) : NULL;
         if (z) (void)tss_reduced_set(e->s, z);
         free(z);
         if (tss_reduced_project(e->s, x, NULL) != TSS_OK) return fail(v->r, "%s: test state %d cannot be projected", v->r->o.scene, f);
@@ -1496,7 +1586,7 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     int count = v->d->samples;
     double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
-    double *z = neural_z(v, &e->m, x, count);
+    double *z = neural_z(v, &e->m, e == &t->e[NEURAL_TRIAL_LIPSCHITZ] ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, x, count);
     tss_result r = neural_eq7(v, &e->m, v->elements, 0, 2, count, x, z, &e->lip_decoder);
     for (int o = 0; o < 3 && r == TSS_OK; o++) r = neural_eq7(v, &e->m, v->elements, 1, o, count, x, z, &e->lip[o]);
     double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
@@ -1592,7 +1682,7 @@ static double neural_relative(int count, int width, const double *a, const doubl
 static double *neural_other_states(neural *v, const tss_model *m, int count) {
     size_t r = (size_t)v->d->r, skip = (size_t)v->d->lipschitz.samples;
     double *x = neural_spread(v, v->test, v->tests, count);
-    double *z = neural_z(v, m, x, v->d->unsupervised ? count + (int)skip : count);
+    double *z = neural_z(v, m, NEURAL_BASE, x, v->d->unsupervised ? count + (int)skip : count);
     if (v->d->unsupervised) memmove(z, z + skip * r, (size_t)count * r * sizeof *z);
     free(x);
     return z;
@@ -1675,7 +1765,7 @@ static int neural_measure(neural *v) {
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
     if (!there) return fail(v->r, "%s/base_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, v->r->o.seed, v->r->o.scene);
-    int ok = neural_cubature(v, &base, v->d->lipschitz.cubature, &v->cubature, &s) && neural_cubature_errors(v, &base, error);
+    int ok = neural_cubature(v, &base, NEURAL_BASE, v->d->lipschitz.cubature, &v->cubature, &s) && neural_cubature_errors(v, &base, error);
     tss_model_free(&base);
     ok = ok && neural_step_costs(v, seconds) && neural_measure_row(v, &s, error, seconds);
     if (ok)
@@ -1737,7 +1827,7 @@ static int neural_shoot(neural_trial *t, neural_album *a) {
 static int neural_watch_step(neural_trial *t, int sequence, int k, void *ctx) {
     neural_album *a = (neural_album *)ctx;
     int stride = t->v->d->script.stride, tests = t->steps;
-    int at = sequence * (t->v->d->script.length / stride) + k / stride;
+    int settle = t->v->d->script.settle, at = sequence * ((t->v->d->script.length - settle) / stride) + (k - settle) / stride;
     for (int q = 0; q < NEURAL_TRIALS; q++) {
         const neural_entry *e = &t->e[q];
         if (e->used)

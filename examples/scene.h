@@ -114,7 +114,8 @@
                            steps from target to target ([10, 20]), length: steps of a sequence (60),
                            train, test: sequences (10, 2), seed (1), stride: quasi-static, steps of
                            the script in one of a subspace (1), validate: evaluate on sequences
-                           behind those of training, not on the tests (false)}
+                           behind those of training, not on the tests (false), settle: steps that
+                           full space takes alone before a subspace starts, at rest, nearest to it (0)}
      .handles[]            {lower, upper, metres: nodes, as in pins; translate, rotate: [[low x, y, z],
                            [high]], m, and degrees along the axis, about the middle of the nodes}
      .ball                 walks as handles do: {radius, m; center: [[low x, y, z], [high]], m, from low;
@@ -128,7 +129,8 @@
                            (false), through_encoder (true), relative: L_LS in units
                            of the spread of z, supervised (false), handles: L_LS and Eq. 7 of P with
                            handles where the frames have them, supervised (true), window: L_LS of
-                           groups of frames this near under one's handles (0: off), cubature: cells,
+                           groups of frames this near under one's handles (0: off), whiten: in
+                           coordinates in which the mean Hessian of the base is 1 (false), cubature: cells,
                            0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
                            (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0)}
@@ -250,7 +252,7 @@ typedef struct scene_neural {
     struct {
         scene_handle *handle;
         scene_pull *pull;
-        int handles, pulls, length, train, test, seed, stride, validate;
+        int handles, pulls, length, train, test, seed, stride, validate, settle;
         double hold[2];
         struct {  // radius 0: none
             double radius, center[2][3], stiffness, margin;
@@ -265,7 +267,7 @@ typedef struct scene_neural {
         double rate, rate_end, lambda, sigma, eps;
     } train;
     struct {
-        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples;
+        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples, whiten;
         double rate, rate_end, weight;
     } lipschitz;
     struct {
@@ -1839,6 +1841,7 @@ static const scene__key scene__script_keys[] = {
     SCENE__INT(scene_neural, script.seed, "seed", 0, 1e9),
     SCENE__INT(scene_neural, script.stride, "stride", 1, 1e6),
     SCENE__OF(SCENE__FLAG, scene_neural, script.validate, "validate"),
+    SCENE__INT(scene_neural, script.settle, "settle", 0, 1e6),
     SCENE__END};
 static const scene__key scene__pca_keys[] = {
     SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000),
@@ -1869,6 +1872,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.relative, "relative"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.handles, "handles"),
     SCENE__INT(scene_neural, lipschitz.window, "window", 0, 1e6),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten, "whiten"),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
     SCENE__END};
