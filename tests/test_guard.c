@@ -15,6 +15,8 @@
 #define TSS_IMPLEMENTATION
 #include "tss.h"
 #include "tss_ipc.h"
+#include "tss_io.h"
+#include "tss_shapes.h"
 
 // ---- scenes -----------------------------------------------------------------------------------
 
@@ -315,6 +317,50 @@ static void test_set_free(void **state) {
         assert_non_null(p);
         tss_world_destroy(w);
     }
+}
+
+static double volume(const double *a, const double *b, const double *c, const double *d) {
+    double u[3], v[3], w[3];
+    for (int i = 0; i < 3; i++) u[i] = b[i] - a[i], v[i] = c[i] - a[i], w[i] = d[i] - a[i];
+    return u[0] * (v[1] * w[2] - v[2] * w[1]) - u[1] * (v[0] * w[2] - v[2] * w[0]) + u[2] * (v[0] * w[1] - v[1] * w[0]);
+}
+
+// Two bodies that overlap: the start check's tree finds as many crossings as every edge against every
+// triangle, by signs of volumes, one by one.
+static void test_all_crossings(void **state) {
+    (void)state;
+    tss_world_def wd = tss_world_def_default();
+    tss_world *w = make_world(&wd);
+    for (int b = 0; b < 2; b++) {
+        tss_shape_def d = tss_shape_def_default(b ? TSS_SHAPE_TORUS : TSS_SHAPE_BALL);
+        tss_mesh m;
+        d.cells = 10 + 2 * b;
+        assert_int_equal(tss_shape_make(NULL, &d, &m), TSS_OK);
+        for (int i = 0; i < 3 * m.nodes; i++) m.x[i] += b * (.21 + .07 * (i % 3));
+        add_cells(w, tss_body_def_default(), m.x, m.nodes, m.tet, m.tets);
+        tss_mesh_free(&m);
+    }
+    add_contact(w, 0, 0, 0);
+    tss_check_report r;
+    expect(w, tss_world_check(w, &r), TSS_OK);
+    tss_surface s;
+    expect(w, tss_world_surface(w, &s), TSS_OK);
+    const double *x = tss_world_positions(w);
+    int crossings = 0, said = -1;
+    for (int e = 0; e < s.edges; e++)
+        for (int t = 0; t < s.triangles; t++) {
+            const int *v = s.edge + 2 * e, *f = s.triangle + 3 * t;
+            const double *p = x + 3 * v[0], *q = x + 3 * v[1], *c[3] = {x + 3 * f[0], x + 3 * f[1], x + 3 * f[2]};
+            int shared = 0, positive = 0;
+            for (int k = 0; k < 6; k++) shared |= v[k % 2] == f[k / 2];
+            if (shared || (volume(p, c[0], c[1], c[2]) > 0) == (volume(q, c[0], c[1], c[2]) > 0)) continue;
+            for (int k = 0; k < 3; k++) positive += volume(p, q, c[k], c[(k + 1) % 3]) > 0;
+            crossings += positive == 0 || positive == 3;
+        }
+    for (int k = 0; k < r.count; k++) sscanf(r.issue[k].text, "contact: %d intersections in all", &said);
+    assert_true(crossings > 50);
+    assert_int_equal(said, crossings);
+    tss_world_destroy(w);
 }
 
 // Setting one node free looks near that node: it finds the crossing there, and passes over one
@@ -908,6 +954,7 @@ int main(void) {
         cmocka_unit_test(test_wide_ground),       cmocka_unit_test(test_far_from_origin),
         cmocka_unit_test(test_pinned_in_the_way), cmocka_unit_test(test_glued_and_through),
         cmocka_unit_test(test_set_free),          cmocka_unit_test(test_fresh_only),
+        cmocka_unit_test(test_all_crossings),
         cmocka_unit_test(test_caught_and_freed),  cmocka_unit_test(test_removed_nodes),
         cmocka_unit_test(test_stiffness_stays),   cmocka_unit_test(test_tiny_reach),
         cmocka_unit_test(test_not_finite),        cmocka_unit_test(test_load_refuses),
