@@ -5,7 +5,7 @@
 # OUT (bench/results). A part whose rows are in its CSV already is not run again, and training goes on
 # where it stopped: call it until it ends with 0 (3: MINUTES are over; 1: something failed).
 #   part     file                  system (unless -s)    paper B
-#   methods  neural.csv            all small; also -s dinosaur, -s bunny   Table 1: vanilla, lipschitz, linear, full
+#   methods  neural.csv            all small; also -s twist_bar, cloth, dinosaur, elephant, bunny   Table 1: vanilla, lipschitz, linear, full
 #   newton   neural_newton.csv     all small             Table 4: projected Newton
 #   eps      neural_eps.csv        twist, pulled, bist.  Table 2: eps 1e-4, 1e-5, 1e-6
 #   order    neural_order.csv      twist, pulled         Table 3: L_LS of order 0, 1, 2

@@ -21,7 +21,7 @@
            seconds spent.
    run     the test sequences in full space and in each subspace: steps_N.csv, pictures, report.html
    evaluate the same, and Eq. 7 and projections of the test's states: a row a method is appended to
-           DIR/evaluate.csv
+           DIR/evaluate.csv. --no-full: full space is what frames.bin has, not run and timed again
 
    measure what the cubature misses on the base, and what a training step costs: a row to
            DIR/measure.csv
@@ -1352,7 +1352,10 @@ static int neural_entry_open(neural_trial *t, int which) {
     e->energy = e->gradient + steps, e->mean = e->energy + steps, e->farthest = e->mean + steps;
     e->iterations = (int *)need(3 * steps, sizeof(int)), e->evaluations = e->iterations + steps, e->exit = e->evaluations + steps;
     for (size_t k = 0; k < steps; k++) e->seconds[k] = INFINITY;
-    if (which == NEURAL_TRIAL_FULL) return e->used = 1;
+    if (which == NEURAL_TRIAL_FULL) {
+        e->used = !v->r->o.no_full;
+        return 1;
+    }
     if (which == NEURAL_TRIAL_LINEAR && d->unsupervised) return 1;
     neural_phase phase = which == NEURAL_TRIAL_VANILLA ? NEURAL_VANILLA : NEURAL_LIPSCHITZ;
     if (which == NEURAL_TRIAL_LINEAR ? !neural_linear(v, &e->m) : !neural_read(v, phase, &e->m, &there)) return 0;
@@ -1442,8 +1445,13 @@ static double neural_cpu(void) {
 // With one thread the time that it ran: what else the machine does then counts little.
 static double neural_clock(const neural *v) { return v->r->o.threads == 1 ? neural_cpu() : now(NULL); }
 
-// Step k of a sequence by one subspace; `at`: of all test steps. Seconds include decoding.
-static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
+// Where full space has step k of a test sequence.
+static const double *neural_truth(const neural_trial *t, int sequence, int k) {
+    return t->v->test + ((size_t)sequence * (size_t)t->v->d->script.length + (size_t)k) * (size_t)t->v->n;
+}
+
+// A step of the tests by one subspace; `at`: of all. Seconds include decoding.
+static int neural_trial_step(neural_trial *t, neural_entry *e, int at, const double *truth) {
     neural *v = t->v;
     tss_reduced_info i;
     double began = neural_clock(v);
@@ -1455,7 +1463,7 @@ static int neural_trial_step(neural_trial *t, neural_entry *e, int at) {
     e->seconds[at] = fmin(e->seconds[at], neural_clock(v) - began);
     e->iterations[at] = i.iterations, e->evaluations[at] = i.evaluations, e->exit[at] = (int)i.exit;
     e->gradient[at] = i.gradient, e->energy[at] = i.energy;
-    neural_distance(t, x, tss_world_positions(v->r->w), &e->mean[at], &e->farthest[at]);
+    neural_distance(t, x, truth, &e->mean[at], &e->farthest[at]);
     return 1;
 }
 
@@ -1481,11 +1489,12 @@ static int neural_trial_sequence(neural_trial *t, int number, const neural_start
     neural *v = t->v;
     neural_script s = neural_script_of(v, t->first + number);
     int ok = load_world(v->r, v->r->w, start->data, start->size), stride = v->d->script.stride, settle = v->d->script.settle;
+    int full = t->e[NEURAL_TRIAL_FULL].used;
     tss_step_info first;
-    for (int k = 0; ok && k < settle; k++) ok = neural_full_step(v, &s, k, t->room, &first);
+    for (int k = 0; ok && full && k < settle; k++) ok = neural_full_step(v, &s, k, t->room, &first);
     for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {
         if (!t->e[q].used) continue;
-        const double *from = settle ? tss_world_positions(v->r->w) : v->x0;
+        const double *from = settle ? neural_truth(t, number, settle - 1) : v->x0;
         (void)tss_reduced_set_handles(t->e[q].s, 0, NULL, NULL);
         double *z = settle && t->e[q].m.encoder ? neural_z(v, &t->e[q].m, NEURAL_VANILLA, from, 1) : NULL;
         if (z) (void)tss_reduced_set(t->e[q].s, z);
@@ -1495,11 +1504,12 @@ static int neural_trial_sequence(neural_trial *t, int number, const neural_start
     }
     for (int k = settle + stride - 1; ok && k < s.length; k += stride) {
         int at = number * ((s.length - settle) / stride) + (k - settle) / stride;
-        ok = neural_trial_full(t, &s, k, at);
+        ok = !full || neural_trial_full(t, &s, k, at);
+        memcpy(v->ball.center, s.center + 3 * k, sizeof v->ball.center);
         neural_targets(v, &s, k, t->target), neural_forces(v, &s, k, 1, t->force);
         for (int q = 0; ok && q < NEURAL_TRIAL_FULL; q++) {  // who is first takes turns
             neural_entry *e = &t->e[(q + at) % NEURAL_TRIAL_FULL];
-            if (e->used) ok = neural_trial_step(t, e, at);
+            if (e->used) ok = neural_trial_step(t, e, at, neural_truth(t, number, k));
         }
         if (ok && watch) ok = watch(t, number, k, ctx);
         neural_progress(v, (at + 1.0) / t->steps, "test step %d of %d", at + 1, t->steps);

@@ -78,7 +78,7 @@ typedef struct options {
     int sets, steps, threads, every, check, repeat, from, free_steps, count, sweep;
     double budget_ms, minutes;
     const char *action, *method;  // of neural
-    int seed;
+    int seed, no_full;
 } options;
 
 static int usage(FILE *to) {
@@ -95,7 +95,7 @@ static int usage(FILE *to) {
         "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
         "       tss neural train|run|evaluate|measure SCENE [-o DIR] [--seed N] [--minutes M]\n"
-        "               [--method vanilla|lipschitz] [--threads N] [--set key=value]...\n"
+        "               [--method vanilla|lipschitz] [--no-full] [--threads N] [--set key=value]...\n"
         "       tss --version\n",
         to);
     return to == stdout ? 0 : 2;
@@ -227,6 +227,8 @@ static int read_options(int argc, char **argv, options *o) {
             o->check = 1;
         else if (strcmp(argv[k], "--sweep") == 0)
             o->sweep = 1;
+        else if (strcmp(argv[k], "--no-full") == 0)
+            o->no_full = 1;
         else if (argv[k][0] == '-' && argv[k][1]) {
             if (!take(o, argv[k], argv[k + 1])) return 0;
             k++;
@@ -235,6 +237,8 @@ static int read_options(int argc, char **argv, options *o) {
         else
             return complain("argument", argv[k], "one scene");
     }
+    if (o->no_full && (!o->action || strcmp(o->action, "evaluate") != 0))
+        return complain("--no-full", "", "`tss neural evaluate`");
     return o->scene ? 1 : complain(o->command, "", "a scene");
 }
 
