@@ -1,9 +1,10 @@
 #!/bin/sh
 # Neural subspaces (docs/neural.md): bench/neural.sh [-b BUILD] [-w WORK] [-m MINUTES] [-s SYSTEM]...
-#                                                    [-n SEED]... [-r REPEAT] [OUT] [PART...]
+#                                                    [-n SEED]... [-r REPEAT] [-t STEPS] [OUT] [PART...]
 # Trains the scenes examples/scenes/neural_SYSTEM.json in WORK (build/neural_bench) and adds rows to
 # OUT (bench/results). A part whose rows are in its CSV already is not run again, and training goes on
-# where it stopped: call it until it ends with 0 (3: MINUTES are over; 1: something failed).
+# where it stopped: call it until it ends with 0 (3: MINUTES are over; 1: something failed). -t: of each
+# test sequence only the first STEPS (for the large systems, whose steps take seconds).
 #   part     file                  system (unless -s)    paper B
 #   methods  neural.csv            all small; also -s twist_bar, cloth, dinosaur, elephant, bunny   Table 1: vanilla, lipschitz, linear, full
 #   newton   neural_newton.csv     all small             Table 4: projected Newton
@@ -16,7 +17,7 @@
 # The weight of an order o is λ (Lip_2 / Lip_o)² with the scene's λ for order 2 and vanilla's Eq. 7:
 # then λ Lip² is the same for all.
 set -u
-build=build work= minutes=600 systems= seeds= repeat=3
+build=build work= minutes=600 systems= seeds= repeat=3 steps=
 while [ $# -gt 0 ]; do
     case $1 in
     -b) build=$2; shift 2 ;;
@@ -25,6 +26,7 @@ while [ $# -gt 0 ]; do
     -s) systems="$systems $2"; shift 2 ;;
     -n) seeds="$seeds $2"; shift 2 ;;
     -r) repeat=$2; shift 2 ;;
+    -t) steps=$2; shift 2 ;;
     *) break ;;
     esac
 done
@@ -106,7 +108,7 @@ rows() {
     action=$1 file=$2 system=$3 dir=$4 seed=$5; shift 5
     left >/dev/null || exit 3
     csv=$dir/$action.csv; rm -f "$csv"
-    again=; [ "$action" != evaluate ] || again="--repeat $repeat"
+    again=; [ "$action" != evaluate ] || again="--repeat $repeat ${steps:+--steps $steps}"
     # shellcheck disable=SC2086
     tss "$action" "$system" "$dir" "$seed" $again "$@" && add "$csv" "$file" && echo "$system, seed $seed: $file $*"
 }

@@ -21,7 +21,7 @@
            seconds spent.
    run     the test sequences in full space and in each subspace: steps_N.csv, pictures, report.html
    evaluate the same, and Eq. 7 and projections of the test's states: a row a method is appended to
-           DIR/evaluate.csv. --no-full: full space is what frames.bin has, not run and timed again
+           DIR/evaluate.csv. --steps N: the first N of each sequence. --no-full: full space is what frames.bin has, not run and timed again
 
    measure what the cubature misses on the base, and what a training step costs: a row to
            DIR/measure.csv
@@ -1209,8 +1209,9 @@ static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t)
     t->first = phase == NEURAL_BASE ? 0 : (uint64_t)v->d->train.steps;
     t->last = t->first + (uint64_t)(phase == NEURAL_BASE ? v->d->train.steps : v->d->lipschitz.steps);
     tss_adam_def a = neural_adam(t);
-    if (phase == NEURAL_LIPSCHITZ && !neural_whitening_read(v)) return 0;
     if (!neural_read(v, phase, &t->m, &there)) return 0;
+    // its model's z is y already; how y is spread is asked for where there is no encoder
+    if (phase == NEURAL_LIPSCHITZ && (!there || v->d->unsupervised) && !neural_whitening_read(v)) return 0;
     if (!there && phase == NEURAL_BASE && !neural_fresh(v, &t->m)) return 0;
     if (!there && phase != NEURAL_BASE) {
         if (!neural_read(v, NEURAL_BASE, &t->m, &there)) return 0;
@@ -1323,6 +1324,7 @@ typedef struct neural_trial {
     neural *v;
     neural_entry e[NEURAL_TRIALS];
     int steps, first;  // first sequence: 0, or behind those of training (validate)
+    int each;          // steps of a sequence: all, or --steps of them
     double diagonal, *room, *force, *target;
 } neural_trial;
 
@@ -1363,7 +1365,7 @@ static int neural_entry_open(neural_trial *t, int which) {
         return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
                     v->r->o.seed, v->r->o.scene);
     neural_selection chosen;
-    if (which == NEURAL_TRIAL_LIPSCHITZ && !neural_whitening_read(v)) return 0;
+    if (which == NEURAL_TRIAL_LIPSCHITZ && d->unsupervised && !neural_whitening_read(v)) return 0;
     if (!neural_cubature(v, &e->m, which == NEURAL_TRIAL_LIPSCHITZ ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, d->solver.cubature, &e->cells, &chosen)) return 0;
     tss_reduced_def rd = tss_reduced_def_default();
     rd.decoder = e->m.decoder, rd.elements = e->cells ? e->cells : v->elements, rd.mass = v->mass, rd.h = v->h;
@@ -1399,7 +1401,9 @@ static int neural_trial_open(neural *v, neural_trial *t) {
         if (!ok || v->r->why.text[0]) return 0;
     }
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
-    t->steps = v->d->script.test * ((v->d->script.length - v->d->script.settle) / v->d->script.stride);
+    t->each = (v->d->script.length - v->d->script.settle) / v->d->script.stride;
+    if (v->r->o.steps > 0 && v->r->o.steps < t->each) t->each = v->r->o.steps;
+    t->steps = v->d->script.test * t->each;
     if (t->steps < 1)
         return fail(v->r, "%s: neural.script.settle is %d, expected at least a stride below length (%d)", v->r->o.scene, v->d->script.settle,
                     v->d->script.length);
@@ -1502,8 +1506,8 @@ static int neural_trial_sequence(neural_trial *t, int number, const neural_start
         tss_result r = tss_reduced_project(t->e[q].s, from, NULL);
         if (r != TSS_OK) ok = fail(v->r, "%s: the start cannot be projected: %s", v->r->o.scene, tss_result_text(r));
     }
-    for (int k = settle + stride - 1; ok && k < s.length; k += stride) {
-        int at = number * ((s.length - settle) / stride) + (k - settle) / stride;
+    for (int step = 0; ok && step < t->each; step++) {
+        int k = settle + stride * (step + 1) - 1, at = number * t->each + step;
         ok = !full || neural_trial_full(t, &s, k, at);
         memcpy(v->ball.center, s.center + 3 * k, sizeof v->ball.center);
         neural_targets(v, &s, k, t->target), neural_forces(v, &s, k, 1, t->force);
@@ -1837,7 +1841,7 @@ static int neural_shoot(neural_trial *t, neural_album *a) {
 static int neural_watch_step(neural_trial *t, int sequence, int k, void *ctx) {
     neural_album *a = (neural_album *)ctx;
     int stride = t->v->d->script.stride, tests = t->steps;
-    int settle = t->v->d->script.settle, at = sequence * ((t->v->d->script.length - settle) / stride) + (k - settle) / stride;
+    int settle = t->v->d->script.settle, at = sequence * t->each + (k - settle) / stride;
     for (int q = 0; q < NEURAL_TRIALS; q++) {
         const neural_entry *e = &t->e[q];
         if (e->used)

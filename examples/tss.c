@@ -95,7 +95,7 @@ static int usage(FILE *to) {
         "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
         "       tss neural train|run|evaluate|measure SCENE [-o DIR] [--seed N] [--minutes M]\n"
-        "               [--method vanilla|lipschitz] [--no-full] [--threads N] [--set key=value]...\n"
+        "               [--method vanilla|lipschitz] [--steps N] [--no-full] [--threads N] [--set key=value]...\n"
         "       tss --version\n",
         to);
     return to == stdout ? 0 : 2;
