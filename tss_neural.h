@@ -1577,8 +1577,9 @@ static double tss__cell_rest(int d, const double *X, const int *v, double *Dinv)
 }
 
 // ---- shells ---------------------------------------------------------------------------------
-// Their gradients are written once, over hyper-dual numbers (Fike and Alonso 2011): v + a ε₁ + b ε₂
-// + ab ε₁ε₂ with ε₁² = ε₂² = 0. At x + ε₁A + ε₂B they give ∇, D_A∇, D_B∇ and D²_AB∇, exactly.
+// Their gradients are written over hyper-dual numbers (Fike and Alonso 2011): v + a ε₁ + b ε₂
+// + ab ε₁ε₂ with ε₁² = ε₂² = 0. At x + ε₁A + ε₂B they give ∇, D_A∇, D_B∇ and D²_AB∇, exactly; and
+// once more over plain numbers, for where ∇ is all that is wanted.
 
 typedef struct tss__hd {
     double v, a, b, ab;
@@ -1710,6 +1711,73 @@ static double tss__shell_hinge(double w, double rest, const tss__hd *x, tss__hd 
     return w * gap.v * gap.v;
 }
 
+// ---- shells: the gradient alone -------------------------------------------------------------
+// The operations of the two functions above in their order, so that bits agree (test_plain).
+
+static double tss__n_dot3(const double *x, const double *y) {
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2];
+}
+static void tss__n_cross(const double *x, const double *y, double *out) {
+    out[0] = x[1] * y[2] - x[2] * y[1], out[1] = x[2] * y[0] - x[0] * y[2];
+    out[2] = x[0] * y[1] - x[1] * y[0];
+}
+
+static double tss__plain_cell(const double *Dinv, double vol, double mu, double la, const double *x,
+                              double *g) {
+    double F[2][3], n[3], D[2][3], J = 0, inverse = 0;
+    for (int r = 0; r < 3; r++) {
+        double e = x[3 + r] - x[r], f = x[6 + r] - x[r];
+        F[0][r] = Dinv[0] * e + Dinv[2] * f, F[1][r] = Dinv[1] * e + Dinv[3] * f;
+    }
+    double xx = tss__n_dot3(F[0], F[0]) - 1, yy = tss__n_dot3(F[1], F[1]) - 1;
+    double xy = tss__n_dot3(F[0], F[1]), det = xx * yy - xy * xy;
+    tss__n_cross(F[0], F[1], n);
+    double square = tss__n_dot3(n, n);
+    if (square > 1e-24) J = sqrt(square), inverse = 1 / J;
+    double j = (xx + yy + det) * (1 / (1 + J)), s = (la * j - mu) * inverse;
+    tss__n_cross(F[1], n, D[0]), tss__n_cross(n, F[0], D[1]);
+    for (int r = 0; r < 3; r++) {
+        double P0 = mu * F[0][r] + s * D[0][r], P1 = mu * F[1][r] + s * D[1][r];
+        g[3 + r] = vol * (Dinv[0] * P0 + Dinv[1] * P1);
+        g[6 + r] = vol * (Dinv[2] * P0 + Dinv[3] * P1);
+        g[r] = -(g[3 + r] + g[6 + r]);
+    }
+    return 0.5 * vol * (mu * (j * j - det) + la * j * j);
+}
+
+static double tss__plain_hinge(double w, double rest, const double *x, double *g) {
+    double e[3], a[4][3], N[2][3], across[3];
+    tss__n_zero(g, 12);
+    for (int r = 0; r < 3; r++) {
+        e[r] = x[3 + r] - x[r];
+        a[0][r] = x[6 + r] - x[r], a[1][r] = x[9 + r] - x[r];
+        a[2][r] = x[6 + r] - x[3 + r], a[3][r] = x[9 + r] - x[3 + r];
+    }
+    tss__n_cross(a[0], a[2], N[0]), tss__n_cross(a[3], a[1], N[1]);
+    double E = tss__n_dot3(e, e), n0 = tss__n_dot3(N[0], N[0]), n1 = tss__n_dot3(N[1], N[1]);
+    if (!(E > 0 && n0 > 0 && n1 > 0)) return 0;
+    double l = sqrt(E), unit = 1 / l;
+    tss__n_cross(N[1], N[0], across);
+    double theta = atan2(tss__n_dot3(across, e) * unit, tss__n_dot3(N[0], N[1]));
+    double gap = theta - rest, f = 2 * w * gap, q[2] = {f * (1 / n0), f * (1 / n1)};
+    for (int k = 0; k < 2; k++) {
+        double from_e = q[k] * unit, far = q[k] * l;
+        double from0 = tss__n_dot3(a[2 + k], e) * from_e, from1 = tss__n_dot3(a[k], e) * from_e;
+        for (int r = 0; r < 3; r++) {
+            g[6 + 3 * k + r] = far * N[k][r];
+            g[r] += from0 * N[k][r], g[3 + r] -= from1 * N[k][r];
+        }
+    }
+    return w * gap * gap;
+}
+
+static double tss__plain_stencil(const tss_elements *e, int k, const double *x, double *g) {
+    int hinge = k - e->cells;
+    if (hinge < 0) return tss__plain_cell(e->Dinv + 4 * k, e->vol[k], e->mu[k], e->la[k], x, g);
+    return tss__plain_hinge(e->hinge_weight[2 * hinge] + e->hinge_weight[2 * hinge + 1],
+                            e->rest[hinge], x, g);
+}
+
 // Stencil k: a cell, or the hinge k − cells. Columns of 3·nodes numbers: x, A and B (NULL: 0).
 static double tss__shell_stencil(const tss_elements *e, int k, const double *x, const double *A,
                                  const double *B, tss__hd *g) {
@@ -1740,13 +1808,13 @@ static double tss__shell_run(const tss_elements *e, const int *cell, const int *
                              const double *x, double *g) {
     double P = 0;
     for (int k = 0; k < e->cells + e->hinges; k++) {
-        double at[12];
-        tss__hd G[12];
+        double at[12], G[12];
         int count;
         const int *v = tss__shell_nodes(e, cell, hinge, k, &count);
         tss__shell_gather(x, v, count, at);
-        P += tss__shell_stencil(e, k, at, NULL, NULL, G);
-        for (int i = 0; g && i < 3 * count; i++) g[3 * v[i / 3] + i % 3] += G[i].v;
+        P += tss__plain_stencil(e, k, at, G);
+        for (int i = 0; g && i < count; i++)
+            for (int r = 0; r < 3; r++) g[3 * v[i] + r] += G[3 * i + r];
     }
     return P;
 }
@@ -2084,8 +2152,25 @@ static void tss__shell_jet(tss__n_jet *t, int s, int m, const double *x, double 
     }
 }
 
+// The same without directions: alpha P.
+static void tss__shell_scaled(tss__n_jet *t) {
+    for (int s = 0; s < t->e->cells + t->e->hinges; s++) {
+        double x[12], g[12], f = t->mode == TSS__CELL_TANGENT ? 1 : t->alpha;
+        int count;
+        const int *v = tss__shell_nodes(t->e, t->cell, t->hinge, s, &count);
+        tss__shell_gather(t->x, v, count, x);
+        t->P += tss__plain_stencil(t->e, s, x, g);
+        for (int i = 0; t->mode != TSS__CELL_VALUE && i < count; i++)
+            for (int r = 0; r < 3; r++) t->bar[3 * v[i] + r] += f * g[3 * i + r];
+    }
+}
+
 static void tss__shell_jets(tss__n_jet *t) {
     int cols = 1 + t->k + t->second, count;
+    if (cols == 1) {
+        tss__shell_scaled(t);
+        return;
+    }
     double *x = t->scratch, *hat = x + 12 * cols, *bar = hat + 12 * (t->k + 1);
     for (int s = 0; s < t->e->cells + t->e->hinges; s++) {
         const int *v = tss__shell_nodes(t->e, t->cell, t->hinge, s, &count);
@@ -3011,19 +3096,17 @@ static void tss__cub_fill_shell(const tss__cub_fill *f, int cell, double *to) {
     for (int s = -1; s < (e->hinges ? 3 : 0); s++) {
         int share = s < 0 ? -1 : e->cell_hinge[3 * cell + s], count;
         if (s >= 0 && share < 0) continue;
-        double x[12];
-        tss__hd p[12], g[12];
+        double x[12], g[12];
         const int *v =
             tss__shell_nodes(e, e->cell, e->hinge, s < 0 ? cell : e->cells + share / 2, &count);
         tss__shell_gather(f->x, v, count, x);
-        for (int i = 0; i < 3 * count; i++) p[i] = tss__hd_of(x[i]);
         if (s < 0)
-            tss__shell_cell(e->Dinv + 4 * cell, e->vol[cell], e->mu[cell], e->la[cell], p, g);
+            tss__plain_cell(e->Dinv + 4 * cell, e->vol[cell], e->mu[cell], e->la[cell], x, g);
         else
-            tss__shell_hinge(e->hinge_weight[share], e->rest[share / 2], p, g, NULL);
+            tss__plain_hinge(e->hinge_weight[share], e->rest[share / 2], x, g);
         for (int a = 0; a < f->r; a++) {
             tss__shell_gather(f->x + (size_t)(a + 1) * f->n, v, count, x);
-            for (int i = 0; i < 3 * count; i++) to[a] += f->scale * g[i].v * x[i];
+            for (int i = 0; i < 3 * count; i++) to[a] += f->scale * g[i] * x[i];
         }
     }
 }

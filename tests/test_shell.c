@@ -229,6 +229,52 @@ static void test_jets(void **state) {
     }
 }
 
+// The plain gradient: of each stencil the bits of the hyper-dual one, of the sum against differences
+// of `total`, also where nodes coincide and a hinge is folded.
+static void test_plain(void **state) {
+    (void)state;
+    for (int trial = 0; trial < 12; trial++) {
+        sheet s;
+        double x[N], g[N] = {0}, h[N] = {0}, P = 0, most = 0;
+        sheet_make(&s, 0.05);
+        double size = trial < 4 ? 1e-3 : trial < 8 ? 0.05 : 0.5;
+        for (int i = 0; i < N; i++) x[i] = s.X[i] + size * rnd();
+        if (trial == 11) memcpy(x + 3, x, 3 * sizeof *x), x[N - 1] = x[N - 4] = 0.3;
+        for (int k = 0; k < s.e->cells + s.e->hinges; k++) {
+            double at[12], plain[12];
+            tss__hd dual[12];
+            int count;
+            const int *v = tss__shell_nodes(s.e, s.e->cell, s.e->hinge, k, &count);
+            tss__shell_gather(x, v, count, at);
+            double a = tss__plain_stencil(s.e, k, at, plain);
+            double b = tss__shell_stencil(s.e, k, at, NULL, NULL, dual);
+            P += a;
+            assert_true(a == b && isfinite(a));
+            for (int i = 0; i < 3 * count; i++) {
+                assert_true(plain[i] == dual[i].v && isfinite(plain[i]));
+                h[3 * v[i / 3] + i % 3] += plain[i];
+            }
+        }
+        double Q = tss_elements_potential(s.e, x, g);
+        assert_true(fabs(P - Q) < 1e-13 * P && distance(g, h, N) == 0);
+        double size_g = sqrt(dot(g, g, N));
+        for (int i = 0; trial < 11 && i < N; i++) {
+            double best = INFINITY;
+            for (double d = 1e-3; d > 1e-7; d *= 0.3) {
+                double y[N], up, down;
+                memcpy(y, x, sizeof y);
+                y[i] = x[i] + d, up = (double)total(&s, y, NULL), d = y[i] - x[i];
+                y[i] = x[i] - d, down = (double)total(&s, y, NULL);
+                best = fmin(best, fabs((up - down) / (2 * d) - g[i]));
+            }
+            most = fmax(most, best);
+        }
+        if (trial < 11 && !(most > 0 && most < 2e-7 * size_g))
+            fail_msg("trial %d: off by %g of %g", trial, most, size_g);
+        sheet_free(&s);
+    }
+}
+
 static tss_net *decoder_of(const sheet *s, int r) {
     tss_net_def d = tss_net_def_default();
     int width[3] = {r, 6, 5};
@@ -498,7 +544,7 @@ static int setup(void **state) {
 int main(void) {
 #define T(f) cmocka_unit_test_setup(f, setup)
     const struct CMUnitTest tests[] = {
-        T(test_values),   T(test_jets),    T(test_decoder), T(test_rigid),
+        T(test_values),  T(test_jets),     T(test_plain),   T(test_decoder),  T(test_rigid),
         T(test_cylinder), T(test_stretch), T(test_subsets), T(test_refusals),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
