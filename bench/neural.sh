@@ -14,6 +14,7 @@
 #   cubature neural_cubature.csv   twist, pulled         Fig. 10: cells of the cubature
 #   cost     neural_cost.csv       twist, pulled         Fig. 3: a step of training over r
 #   r        neural_r.csv          pulled                Fig. 11: r
+#   bridge   neural_bridge.csv     twist, pulled, dinosaur_small   none: tangents as bases of the adaptive simulator
 # The weight of an order o is λ (Lip_2 / Lip_o)² with the scene's λ for order 2 and vanilla's Eq. 7:
 # then λ Lip² is the same for all.
 set -u
@@ -31,7 +32,7 @@ while [ $# -gt 0 ]; do
     esac
 done
 work=${work:-$build/neural_bench}; out=${1:-bench/results}; [ $# -eq 0 ] || shift
-parts=${*:-methods newton eps order runtime cubature cost r}
+parts=${*:-methods newton eps order runtime cubature cost r bridge}
 seeds=${seeds:-0 1 2}
 export OMP_NUM_THREADS=1
 mkdir -p "$out" "$work" || exit 1
@@ -108,7 +109,7 @@ rows() {
     action=$1 file=$2 system=$3 dir=$4 seed=$5; shift 5
     left >/dev/null || exit 3
     csv=$dir/$action.csv; rm -f "$csv"
-    again=; [ "$action" != evaluate ] || again="--repeat $repeat ${steps:+--steps $steps}"
+    again="--repeat $repeat ${steps:+--steps $steps}"; [ "$action" != measure ] || again=
     # shellcheck disable=SC2086
     tss "$action" "$system" "$dir" "$seed" $again "$@" && add "$csv" "$file" && echo "$system, seed $seed: $file $*"
 }
@@ -190,13 +191,21 @@ r() {
     done
 }
 
+bridge() {
+    for e in 0.5 0.05; do
+        there neural_bridge.csv system="$1" seed="$2" error_nodes=$e && continue
+        train "$1" "$2" && rows bridge neural_bridge.csv "$1" "$work/$1" "$2" --set solver.error_nodes=$e
+    done
+}
+
 for part in $parts; do
     case $part in
     methods | newton) these=${systems:-twist_bar_small pulled_bar bistable dinosaur_small} ;;
     eps) these=${systems:-twist_bar_small pulled_bar bistable} ;;
     order | runtime | cubature | cost) these=${systems:-twist_bar_small pulled_bar} ;;
     r) these=${systems:-pulled_bar} ;;
-    *) echo "$part: no such part (methods newton eps order runtime cubature cost r)" >&2; exit 2 ;;
+    bridge) these=${systems:-twist_bar_small pulled_bar dinosaur_small} ;;
+    *) echo "$part: no such part (methods newton eps order runtime cubature cost r bridge)" >&2; exit 2 ;;
     esac
     for n in $seeds; do for s in $these; do $part "$s" "$n"; done; done
 done

@@ -780,6 +780,26 @@ static void neural_measures(source *s, report *r, const char *file, int cost) {
     curves_table_free(&t);
 }
 
+static const char *const bridge_header =
+    "system,basis,seed,r,oracle,step_ms,iterates,added,enriched,nodes,refresh_ms,failed,simulation_error,simulation_max,"
+    "start_error,dof,elements,steps,error_nodes,progress,tol_rel";
+
+static void neural_bridge(source *s, report *r) {
+    static const char *const heads[] = {"system", "basis", "seed", "columns", "oracle", "step, ms", "iterates", "nodes added a step",
+        "nodes enriched", "nodes", "of the step: z and the tangent, ms", "steps not converged", "simulation error", "farthest node",
+        "start of a step from f(z)", "DOF", "elements", "steps", "error_nodes", "progress", "tol_rel"};
+    char path[700];
+    curves_table t;
+    report_heading(r, "A decoder's tangent as a basis of the adaptive simulator");
+    if (!open_table(s, r, "neural_bridge.csv", bridge_header, neural_command, &t, path)) return;
+    report_text(r, "The test sequences by the adaptive simulator with the tangent of each decoder and with fixed bases of as many "
+                   "columns, without nodes (off) and with those that the oracle adds (on); beside them the decoders' own solver "
+                   "(manifold). Errors as in Table 1.");
+    if (*t.comment) report_code(r, t.comment);
+    grid_of(r, &t, NULL, heads, no_level);
+    curves_table_free(&t);
+}
+
 static void page_neural(source *s, report *r) {
     static const neural_column exits[] = {{"converged, %", EXIT_CONVERGED, 1}, {"saddle, %", EXIT_SADDLE, 1},
         {"line search, %", EXIT_LINE, 1}, {"iterations, %", EXIT_ITERATIONS, 1}, {"mean exit gradient", GRADIENT, 0},
@@ -808,6 +828,7 @@ static void page_neural(source *s, report *r) {
     report_heading(r, "What a step of training costs (Fig. 3)");
     neural_measures(s, r, "neural_cost.csv", 1);
     neural_dimension(s, r);
+    neural_bridge(s, r);
 }
 
 // ---------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@
    tss neural run      SCENE [-o DIR] [--seed N] ...
    tss neural evaluate SCENE [-o DIR] [--seed N] ...
    tss neural measure  SCENE [-o DIR] [--seed N] ...
+   tss neural bridge   SCENE [-o DIR] [--seed N] ...
 
    The scene's section "neural" (scene.h) says what is learned of its first body, and what happens to
    it, at random: handles (nodes that are told where to be) and pulls (forces). Full space and
@@ -25,6 +26,8 @@
 
    measure what the cubature misses on the base, and what a training step costs: a row to
            DIR/measure.csv
+   bridge  the test sequences by the adaptive simulator, with the decoder's tangent and other bases:
+           rows to DIR/bridge.csv
 
    Eq. 3 costs only as much as the networks: x = x0 + B c with BᵀMB = s² I, so that ‖Δx‖²_M is s²‖Δc‖²
    but for what B does not reach, which no θ alters. Training sees c. s² is the mean of ‖x − x0‖²_M,
@@ -511,27 +514,37 @@ static int neural_even(const neural *v, const neural_script *s, int k) {
     return k >= 2 && n > 0 && v->h == 0;
 }
 
-// Step k in full space. room: n.
-static int neural_full_step(neural *v, const neural_script *s, int k, double *room, tss_step_info *info) {
-    tss_result e = TSS_OK;
-    const double *x = tss_world_positions(v->r->w);
-    memcpy(v->ball.center, s->center + 3 * k, sizeof v->ball.center);
+// Before step k: where the script goes on evenly, the world starts from 2x_t − x_{t−1}. before: x_{t−1},
+// then x_t. room: n.
+static int neural_predict(neural *v, tss_world *w, double *before, const neural_script *s, int k, double *room) {
+    const double *x = tss_world_positions(w);
     for (int i = 0; i < v->n; i++) {
-        room[i] = 2 * x[i] - v->before[i];
-        v->before[i] = x[i];
+        room[i] = 2 * x[i] - before[i];
+        before[i] = x[i];
     }
-    if (neural_even(v, s, k)) e = tss_body_teleport(v->r->w, 0, room, NULL);
+    if (!neural_even(v, s, k) || tss_body_teleport(w, 0, room, NULL) == TSS_OK) return 1;
+    return fail(v->r, "%s: step %d: %s", v->r->o.scene, k + 1, tss_world_error(w));
+}
+
+// Step k in a world; who: for messages. room: n.
+static int neural_world_step(neural *v, tss_world *w, const char *who, const neural_script *s, int k, double *room, tss_step_info *info) {
+    tss_result e = TSS_OK;
     neural_targets(v, s, k, room);
     for (int i = 0; i < v->handles && e == TSS_OK; i++)
-        e = tss_node_target(v->r->w, v->handle[i], room + v->dim * i);
+        e = tss_node_target(w, v->handle[i], room + v->dim * i);
     neural_forces(v, s, k, 0, room);
     for (int q = 0; q < v->d->script.pulls; q++)
         for (int i = 0; i < v->d->script.pull[q].nodes && e == TSS_OK; i++) {
             int node = v->d->script.pull[q].node[i];
-            e = tss_node_force(v->r->w, node, room + v->dim * node);
+            e = tss_node_force(w, node, room + v->dim * node);
         }
-    if (e == TSS_OK) e = tss_world_step(v->r->w, info);
-    return e == TSS_OK ? 1 : fail(v->r, "%s: full space, step %d: %s", v->r->o.scene, k + 1, tss_world_error(v->r->w));
+    if (e == TSS_OK) e = tss_world_step(w, info);
+    return e == TSS_OK ? 1 : fail(v->r, "%s: %s, step %d: %s", v->r->o.scene, who, k + 1, tss_world_error(w));
+}
+
+static int neural_full_step(neural *v, const neural_script *s, int k, double *room, tss_step_info *info) {
+    memcpy(v->ball.center, s->center + 3 * k, sizeof v->ball.center);
+    return neural_predict(v, v->r->w, v->before, s, k, room) && neural_world_step(v, v->r->w, "full space", s, k, room, info);
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -1326,6 +1339,7 @@ typedef struct neural_trial {
     int steps, first;  // first sequence: 0, or behind those of training (validate)
     int each;          // steps of a sequence: all, or --steps of them
     double diagonal, *room, *force, *target;
+    struct neural_bridges *bridges;  // NULL: none
 } neural_trial;
 
 // The best r modes of the frames.
@@ -1489,6 +1503,9 @@ static int neural_trial_full(neural_trial *t, const neural_script *s, int k, int
 
 typedef int neural_watch(neural_trial *t, int sequence, int k, void *ctx);  // 0: fails
 
+static int neural_bridges_begin(neural_trial *t);
+static int neural_bridges_step(neural_trial *t, const neural_script *s, int k, int at);
+
 static int neural_trial_sequence(neural_trial *t, int number, const neural_start *start, neural_watch *watch, void *ctx) {
     neural *v = t->v;
     neural_script s = neural_script_of(v, t->first + number);
@@ -1506,6 +1523,7 @@ static int neural_trial_sequence(neural_trial *t, int number, const neural_start
         tss_result r = tss_reduced_project(t->e[q].s, from, NULL);
         if (r != TSS_OK) ok = fail(v->r, "%s: the start cannot be projected: %s", v->r->o.scene, tss_result_text(r));
     }
+    if (ok && t->bridges) ok = neural_bridges_begin(t);
     for (int step = 0; ok && step < t->each; step++) {
         int k = settle + stride * (step + 1) - 1, at = number * t->each + step;
         ok = !full || neural_trial_full(t, &s, k, at);
@@ -1515,6 +1533,7 @@ static int neural_trial_sequence(neural_trial *t, int number, const neural_start
             neural_entry *e = &t->e[(q + at) % NEURAL_TRIAL_FULL];
             if (e->used) ok = neural_trial_step(t, e, at, neural_truth(t, number, k));
         }
+        if (ok && t->bridges) ok = neural_bridges_step(t, &s, k, at);
         if (ok && watch) ok = watch(t, number, k, ctx);
         neural_progress(v, (at + 1.0) / t->steps, "test step %d of %d", at + 1, t->steps);
     }
@@ -1669,6 +1688,254 @@ static int neural_evaluate(neural *v) {
                b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
         ok = neural_rows(&t);
     }
+    neural_trial_close(&t);
+    return ok;
+}
+
+// ---------------------------------------------------------------------------------------------
+// >>neural_bridge: the tests by the adaptive simulator (tss_subspace.h), beside full space: the tangent
+// of each decoder at the state at hand, and fixed bases of as many columns, each with and without the
+// oracle. All have full space's energy, script and solver tolerance; all columns are active, so that
+// what the oracle adds are nodes. Fixed bases start where full space does. A tangent starts from x_t as
+// it is: what 2x_t − x_{t−1} adds across the manifold, no later tangent takes back (neural.md). If quasi-
+// static, where the start is a guess and no more, it is tried too with the start moved onto the manifold
+// ("retracted"). The decoders' own solver runs along.
+// ---------------------------------------------------------------------------------------------
+
+typedef enum neural_bridge_kind { NEURAL_BRIDGE_TANGENT, NEURAL_BRIDGE_LINEAR, NEURAL_BRIDGE_EIGEN, NEURAL_BRIDGE_SKINNING } neural_bridge_kind;
+
+static const struct {
+    const char *name;
+    neural_bridge_kind kind;
+    int model, retract;  // model: of a tangent, of the trial's
+} neural_bridge_bases[] = {
+    {"vanilla", NEURAL_BRIDGE_TANGENT, NEURAL_TRIAL_VANILLA, 0}, {"vanilla_retracted", NEURAL_BRIDGE_TANGENT, NEURAL_TRIAL_VANILLA, 1},
+    {"lipschitz", NEURAL_BRIDGE_TANGENT, NEURAL_TRIAL_LIPSCHITZ, 0}, {"lipschitz_retracted", NEURAL_BRIDGE_TANGENT, NEURAL_TRIAL_LIPSCHITZ, 1},
+    {"linear", NEURAL_BRIDGE_LINEAR, 0, 0}, {"eigen", NEURAL_BRIDGE_EIGEN, 0, 0}, {"skinning", NEURAL_BRIDGE_SKINNING, 0, 0},
+};
+enum { NEURAL_BRIDGES = sizeof neural_bridge_bases / sizeof *neural_bridge_bases };
+
+typedef struct neural_bridge_entry {
+    neural_trial *t;
+    int basis, oracle, columns, fresh;  // fresh: no step of the sequence yet
+    tss_world *w;
+    neural_start start;
+    double *before, *room;       // n, n × (r + 1)
+    tss_decoder_basis *tangent;  // NULL: a fixed basis
+    const tss_net *decoder;
+    double refresh, off;  // of the step at hand: s; distance of its start from f(z)
+    double *seconds, *refreshes, *offs, *mean, *farthest;  // of each step, as of neural_entry
+    int *iterates, *added, *enriched, *failed;
+} neural_bridge_entry;
+
+typedef struct neural_bridges {
+    neural_bridge_entry e[2 * NEURAL_BRIDGES];
+    int count, nodes;  // nodes: unknown ones
+} neural_bridges;
+
+// tss_decoder_basis_refresh, timed.
+static void neural_bridge_refresh(void *user, const tss_ctx *c, int first, int nodes, double *columns) {
+    neural_bridge_entry *e = (neural_bridge_entry *)user;
+    double began = neural_clock(e->t->v), farthest_;
+    tss_decoder_basis_refresh(e->tangent, c, first, nodes, columns);
+    e->refresh += neural_clock(e->t->v) - began;
+    (void)tss_net_forward(e->decoder, e->t->v->work, 1, tss_decoder_basis_z(e->tangent), e->room);
+    neural_distance(e->t, e->room, c->x_t + first * e->t->v->dim, &e->off, &farthest_);
+}
+
+// The world to the nearest f(z), but for what is held.
+static int neural_bridge_retract(neural_bridge_entry *e) {
+    neural *v = e->t->v;
+    tss_ctx c;
+    memset(&c, 0, sizeof c);
+    c.dim = v->dim, c.nodes = v->nodes, c.x_t = tss_world_positions(e->w);
+    neural_bridge_refresh(e, &c, 0, v->nodes, e->room + v->n);
+    for (int i = 0; i < v->n; i++) e->room[i] = v->held[i] ? c.x_t[i] : e->room[i];
+    return tss_body_teleport(e->w, 0, e->room, NULL) == TSS_OK ? 1 : fail(v->r, "%s: bridge: %s", v->r->o.scene, tss_world_error(e->w));
+}
+
+// Skinning modes come in blocks of d(d + 1) columns: as many as have at least r. Where nothing is held
+// the constant is a block that is not counted.
+static int neural_bridge_handles(const neural *v) {
+    int block = v->dim * (v->dim + 1), handles = (v->d->r + block - 1) / block, held = 0;
+    for (int i = 0; i < v->n; i++) held |= v->held[i];
+    return held || handles == 1 ? handles : handles - 1;
+}
+
+static int neural_bridge_basis(neural_bridge_entry *e) {
+    neural_trial *t = e->t;
+    neural *v = t->v;
+    int r = v->d->r;
+    double *B = (double *)need((size_t)v->n * (size_t)r, sizeof *B);
+    tss_basis_def d = tss_basis_eigen(r);
+    tss_basis_info info;
+    tss_basis id;
+    tss_result ok = TSS_OK;
+    neural_bridge_kind kind = neural_bridge_bases[e->basis].kind;
+    if (kind == NEURAL_BRIDGE_SKINNING) {
+        d = tss_basis_skinning(neural_bridge_handles(v)), d.initial = -1;
+    } else if (kind == NEURAL_BRIDGE_LINEAR) {
+        for (int j = 0; j < v->n; j++)
+            for (int k = 0; k < r; k++) B[j * r + k] = v->B[(size_t)j * (size_t)v->p + (size_t)k];
+        d = tss_basis_arrays(r, NULL, B, NULL);
+    } else if (kind == NEURAL_BRIDGE_TANGENT) {
+        const tss_model *m = &t->e[neural_bridge_bases[e->basis].model].m;
+        e->decoder = m->decoder;
+        ok = tss_decoder_basis_create(tss_world_host(e->w), v->dim, m->decoder, m->encoder, v->mass, NULL, &e->tangent);
+        d = tss_basis_custom(r, NULL, neural_bridge_refresh, e);
+    }
+    if (ok == TSS_OK) ok = tss_basis_add(e->w, 0, &d, &id);
+    if (ok == TSS_OK) ok = tss_basis_get(e->w, id, &info);
+    free(B);
+    if (ok != TSS_OK)
+        return fail(v->r, "%s: bridge: %s: %s", v->r->o.scene, neural_bridge_bases[e->basis].name,
+                    tss_world_error(e->w)[0] ? tss_world_error(e->w) : tss_result_text(ok));
+    e->columns = info.modes;
+    return 1;
+}
+
+static int neural_bridge_open(neural_bridge_entry *e) {
+    neural *v = e->t->v;
+    size_t steps = (size_t)e->t->steps;
+    tss_subspace_def d = scene__subspace_def(&v->r->s);
+    tss_result ok;
+    e->seconds = (double *)need(5 * steps, sizeof(double)), e->refreshes = e->seconds + steps, e->offs = e->refreshes + steps;
+    e->mean = e->offs + steps, e->farthest = e->mean + steps;
+    e->iterates = (int *)need(4 * steps, sizeof(int)), e->added = e->iterates + steps, e->enriched = e->added + steps;
+    e->failed = e->enriched + steps, e->before = (double *)need((size_t)v->n * (size_t)(v->d->r + 2), sizeof(double)), e->room = e->before + v->n;
+    for (size_t k = 0; k < steps; k++) e->seconds[k] = INFINITY;
+    if (!neural_world(v, &e->w)) return 0;
+    d.mode = e->oracle ? TSS_MODE_ADAPTIVE : TSS_MODE_SUBSPACE;
+    ok = tss_subspace_add(e->w, &d, NULL);
+    for (int i = 0; i < v->handles && ok == TSS_OK; i++)  // a basis must find them scripted
+        ok = tss_node_target(e->w, v->handle[i], v->x0 + v->dim * v->handle[i]);
+    if (ok != TSS_OK) return fail(v->r, "%s: bridge: %s", v->r->o.scene, tss_world_error(e->w));
+    if (!neural_bridge_basis(e)) return 0;
+    if (tss_world_ready(e->w) != TSS_OK) return fail(v->r, "%s: bridge: %s", v->r->o.scene, tss_world_error(e->w));
+    e->start.data = save_world(e->w, &e->start.size);
+    return 1;
+}
+
+static void neural_bridge_close(neural_bridge_entry *e) {
+    tss_world_destroy(e->w), tss_decoder_basis_destroy(e->tangent);
+    free(e->start.data), free(e->before), free(e->seconds), free(e->iterates);
+}
+
+// Before the first step of a sequence; what settled is taken from full space.
+static int neural_bridges_begin(neural_trial *t) {
+    neural *v = t->v;
+    int ok = 1;
+    for (int q = 0; ok && q < t->bridges->count; q++) {
+        neural_bridge_entry *e = &t->bridges->e[q];
+        ok = load_world(v->r, e->w, e->start.data, e->start.size);
+        e->fresh = 1;
+        memcpy(e->before, v->before, (size_t)v->n * sizeof *e->before);
+        if (ok && v->d->script.settle && tss_world_copy_state(e->w, v->r->w) != TSS_OK)
+            ok = fail(v->r, "%s: bridge: %s", v->r->o.scene, tss_world_error(e->w));
+        double *z = (double *)need((size_t)v->d->r, sizeof *z);
+        if (e->tangent) (void)tss_decoder_basis_set(e->tangent, z);
+        free(z);
+    }
+    return ok;
+}
+
+static int neural_bridge_enriched(const neural_bridge_entry *e) {
+    tss_subspace_info info;
+    int count = 0;
+    tss_subspace_get_info(tss_subspace_of(e->w), &info);
+    for (int i = 0; info.enriched && !e->fresh && i < e->t->v->nodes; i++) count += info.enriched[i] != 0;
+    return count;
+}
+
+static int neural_bridges_step(neural_trial *t, const neural_script *s, int k, int at) {
+    neural *v = t->v;
+    neural_bridges *b = t->bridges;
+    for (int q = 0; q < b->count; q++) {  // who is first takes turns
+        neural_bridge_entry *e = &b->e[(q + at) % b->count];
+        tss_step_info i;
+        int before = neural_bridge_enriched(e), retract = neural_bridge_bases[e->basis].retract;
+        double began = neural_clock(v);
+        e->refresh = e->off = 0;
+        if ((!e->tangent || retract) && !neural_predict(v, e->w, e->before, s, k, t->room)) return 0;
+        if (retract && !neural_bridge_retract(e)) return 0;
+        if (!neural_world_step(v, e->w, neural_bridge_bases[e->basis].name, s, k, t->room, &i)) return 0;
+        double spent = neural_clock(v) - began;
+        if (spent < e->seconds[at]) e->seconds[at] = spent, e->refreshes[at] = e->refresh;
+        e->iterates[at] = i.newton, e->enriched[at] = i.enriched_nodes, e->added[at] = i.enriched_nodes - before;
+        e->failed[at] = i.status != TSS_STEP_CONVERGED, e->offs[at] = e->off, e->fresh = 0, b->nodes = i.nodes;
+        neural_distance(t, tss_world_positions(e->w), tss_world_positions(v->r->w), &e->mean[at], &e->farthest[at]);
+    }
+    return 1;
+}
+
+static const char neural_bridge_head[] =
+    "system,basis,seed,r,oracle,step_ms,iterates,added,enriched,nodes,refresh_ms,failed,simulation_error,simulation_max,"
+    "start_error,dof,elements,steps,error_nodes,progress,tol_rel\n";
+
+static void neural_bridge_row(const neural_trial *t, FILE *f, const char *basis, int columns, const char *oracle, const double value[10]) {
+    const neural *v = t->v;
+    char name[120];
+    fprintf(f, "%s,%s,%d,%d,%s", sweep_name(v->r, name), basis, v->r->o.seed, columns, oracle);
+    for (int k = 0; k < 10; k++) fprintf(f, ",%.6g", value[k]);
+    fprintf(f, ",%d,%d,%d,%g,%g,%g\n", v->n, v->cells, t->steps, v->r->s.solver.error_nodes, v->r->s.solver.progress, v->r->s.solver.tol_rel);
+    printf("%-19s %5d %-8s %9.3f %9.3f %7.1f %8.2f %9.1f %7g %10.3g %10.3g %10.3g\n", basis, columns, oracle, value[0], value[5],
+           value[1], value[2], value[3], value[6], value[7], value[8], value[9]);
+}
+
+static void neural_bridge_write(neural_trial *t, FILE *f) {
+    int n = t->steps;
+    printf("%-19s %5s %-8s %9s %9s %7s %8s %9s %7s %10s %10s %10s\n", "basis", "r", "oracle", "ms/step", "refresh", "iter.", "added",
+           "enriched", "failed", "error", "farthest", "start");
+    for (int k = 0; k < t->bridges->count; k++) {
+        const neural_bridge_entry *e = &t->bridges->e[k];
+        double value[10] = {1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterates, n), neural_mean_of(e->added, n),
+                            neural_mean_of(e->enriched, n), t->bridges->nodes, 1e3 * neural_mean(e->refreshes, n), n * neural_mean_of(e->failed, n),
+                            neural_mean(e->mean, n), neural_most(e->farthest, n), neural_mean(e->offs, n)};
+        neural_bridge_row(t, f, neural_bridge_bases[e->basis].name, e->columns, e->oracle ? "on" : "off", value);
+    }
+    for (int k = 0; k < NEURAL_TRIALS; k++) {
+        const neural_entry *e = &t->e[k];
+        int full = k == NEURAL_TRIAL_FULL, nodes = t->bridges->nodes, late = neural_exits(e, n, TSS_EXIT_ITERATIONS);
+        double value[10] = {1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), 0, full * nodes, nodes, 0, late,
+                            neural_mean(e->mean, n), neural_most(e->farthest, n), 0};
+        if (e->used) neural_bridge_row(t, f, neural_trial_names[k], full ? t->v->n : t->v->d->r, full ? "none" : "manifold", value);
+    }
+}
+
+static int neural_bridge_rows(neural_trial *t) {
+    const run *r = t->v->r;
+    char path[700], machine[160];
+    snprintf(path, sizeof path, "%s/bridge.csv", r->o.out);
+    int old = access(path, F_OK) == 0;
+    FILE *f = fopen(path, "a");
+    if (!f) return fail(t->v->r, "%s: cannot be written: %s", path, strerror(errno));
+    neural_machine(machine);
+    fprintf(f, "# %s, threads %d, best of %d", machine, r->o.threads, r->o.repeat);
+    for (int k = 0; k < r->o.sets; k++) fprintf(f, "%s %s", k ? "" : ", with", r->o.set[k]);
+    fputc('\n', f);
+    if (!old) fputs(neural_bridge_head, f);
+    neural_bridge_write(t, f);
+    return fclose(f) == 0 ? 1 : fail(t->v->r, "%s: cannot be written", path);
+}
+
+// Every step of the script is a step of all.
+static int neural_bridge(neural *v) {
+    static neural_bridges b;
+    neural_trial t;
+    memset(&t, 0, sizeof t), memset(&b, 0, sizeof b);
+    if (v->shell) return fail(v->r, "%s: bridge: bodies[0].shell: expected a body of tetrahedra or plane triangles", v->r->o.scene);
+    v->d->script.stride = 1;
+    int ok = neural_trial_open(v, &t);
+    t.bridges = &b;
+    for (int k = 0; ok && k < 2 * NEURAL_BRIDGES; k++) {
+        neural_bridge_entry *e = &b.e[b.count];
+        if (neural_bridge_bases[k / 2].kind == NEURAL_BRIDGE_LINEAR && v->d->unsupervised) continue;
+        if (neural_bridge_bases[k / 2].retract && v->h > 0) continue;
+        e->t = &t, e->basis = k / 2, e->oracle = k % 2, b.count++;
+        ok = neural_bridge_open(e);
+    }
+    ok = ok && neural_trial_run(&t, NULL, NULL) && neural_bridge_rows(&t);
+    for (int k = 0; k < b.count; k++) neural_bridge_close(&b.e[k]);
     neural_trial_close(&t);
     return ok;
 }
@@ -1925,7 +2192,8 @@ static int command_neural(run *r) {
     static neural v;
     int ok = neural_open(r, &v);
     if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v)
-                  : strcmp(r->o.action, "measure") == 0 ? neural_measure(&v) : neural_evaluate(&v);
+                  : strcmp(r->o.action, "measure") == 0 ? neural_measure(&v)
+                  : strcmp(r->o.action, "bridge") == 0 ? neural_bridge(&v) : neural_evaluate(&v);
     neural_close(&v);
     return !ok ? 2 : v.stopped ? 3 : 0;
 }

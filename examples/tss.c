@@ -8,7 +8,7 @@
    tss compare --sweep SCENE [--nodes LIST] [--modes LIST] [--tols LIST] [--name NAME] ...
    tss modes SCENE [-o DIR] [--count K] ...
    tss check SCENE [--assets DIR] [--set key=value]...
-   tss neural train|run|evaluate|measure SCENE [-o DIR] [--seed N] [--minutes M]
+   tss neural train|run|evaluate|measure|bridge SCENE [-o DIR] [--seed N] [--minutes M]
               [--method vanilla|lipschitz] [--threads N] [--set key=value]...
    tss --version | --help
 
@@ -94,7 +94,7 @@ static int usage(FILE *to) {
         "               [--name NAME], and the options of compare\n"
         "       tss modes SCENE [-o DIR] [--count K] [--assets DIR] [--set key=value]...\n"
         "       tss check SCENE [--assets DIR] [--set key=value]...\n"
-        "       tss neural train|run|evaluate|measure SCENE [-o DIR] [--seed N] [--minutes M]\n"
+        "       tss neural train|run|evaluate|measure|bridge SCENE [-o DIR] [--seed N] [--minutes M]\n"
         "               [--method vanilla|lipschitz] [--steps N] [--no-full] [--threads N] [--set key=value]...\n"
         "       tss --version\n",
         to);
@@ -216,10 +216,10 @@ static int read_options(int argc, char **argv, options *o) {
     int first = 2;
     if (strcmp(o->command, "neural") == 0) {
         o->action = argc > 2 ? argv[2] : "";
-        static const char *const actions[] = {"train", "run", "evaluate", "measure"};
+        static const char *const actions[] = {"train", "run", "evaluate", "measure", "bridge"};
         int k = 0;
-        while (k < 4 && strcmp(o->action, actions[k]) != 0) k++;
-        if (k == 4) return complain("neural", o->action, "train, run, evaluate or measure");
+        while (k < 5 && strcmp(o->action, actions[k]) != 0) k++;
+        if (k == 5) return complain("neural", o->action, "train, run, evaluate, measure or bridge");
         first = 3;
     }
     for (int k = first; k < argc; k++) {

@@ -47,6 +47,16 @@ refused() { words=$1; shift; tss "$@" >"$build/neural_bad.log" 2>&1; [ $? = 2 ] 
 claim "neural: measures" 'tss measure "$out/a" --threads 1 >>"$build/neural.log" 2>&1 && grep -q "^neural_twist_bar_small,0,135,80,4,20,20," "$out/a/measure.csv"'
 claim "neural: a cubature at run time" 'tss evaluate "$out/a" --set neural.solver.cubature=20 >>"$build/neural.log" 2>&1 &&
     [ "$(awk -F, "\$2 == \"lipschitz\" {c = \$(NF - 1)} END {print c}" "$out/a/evaluate.csv")" = 20 ]'
+# bridge BASIS ORACLE COLUMN of bridge.csv; 7 bases with and without the oracle, 3 manifolds, full space
+bridge() { awk -F, -v b="$1" -v o="$2" -v c="$3" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == b && $5 == o {print $k}' "$out/a/bridge.csv"; }
+claim "neural: bridge" 'tss bridge "$out/a" --threads 1 >>"$build/neural.log" 2>&1 && [ "$(grep -c "^neural_twist_bar_small," "$out/a/bridge.csv")" = 18 ]'
+claim "neural: bridge: the header is the documented one" 'grep -q "^system,basis,seed,r,oracle,step_ms,iterates,added,enriched,nodes,refresh_ms,failed,simulation_error,simulation_max,start_error," "$out/a/bridge.csv"'
+claim "neural: bridge: a linear basis is the reduced solver's subspace" 'less "$(bridge linear off simulation_error)" 1 &&
+    awk -v a="$(bridge linear off simulation_error)" -v b="$(bridge linear manifold simulation_error)" "BEGIN {exit !(a > 0 && a < 1.1 * b && b < 1.1 * a)}"'
+claim "neural: bridge: r is rounded up to blocks of 12 skinning modes" '[ "$(bridge skinning off r)" = 12 ] && [ "$(bridge eigen off r)" = 4 ]'
+claim "neural: bridge: no nodes without the oracle, and with it less error" '[ "$(bridge vanilla off enriched)" = 0 ] && less 0 "$(bridge vanilla on added)" &&
+    less "$(bridge vanilla on simulation_error)" "$(bridge vanilla off simulation_error)"'
+claim "neural: bridge: everything converges" '[ "$(for b in vanilla vanilla_retracted lipschitz linear eigen skinning; do bridge $b off failed; bridge $b on failed; done | sort -u)" = 0 ]'
 # cloth ACTION OPTION...
 cloth() {
     action=$1; shift
@@ -56,11 +66,12 @@ cloth() {
 }
 claim "neural: cloth and a ball" 'cloth train && cloth evaluate && cloth run && [ -s "$out/d/states_0.png" ]'
 claim "neural: cloth: full space converges" '[ "$(awk -F, "\$2 == \"full\" {print \$10, \$13}" "$out/d/evaluate.csv")" = "15 0" ]'
+claim "neural: refused: the bridge of a shell" '! cloth bridge && grep -q "bridge: bodies\[0\].shell: expected a body of tetrahedra" "$build/neural_d.log"'
 bad_cloth() { words=$1; shift; cloth train "$@"; [ $? = 2 ] && grep -q -e "$words" "$build/neural_d.log"; }
 claim "neural: refused: a shell of tets" 'bad_cloth "expected a soft surface of triangles" --set bodies.0.shape.kind=box --set bodies.0.shape.upper=[1,1,1]'
 claim "neural: refused: a ball without a radius" 'bad_cloth "radius" --set neural.script.ball.radius=0'
 claim "neural: refused: a ball that meets no shell" 'refused "expected a first body with \"shell\"" train "$out/a" --set neural.script.ball.radius=1 --set neural.script.ball.stiffness=1'
-claim "neural: refused: another action" 'refused "expected train, run, evaluate or measure" walk "$out/a"'
+claim "neural: refused: another action" 'refused "expected train, run, evaluate, measure or bridge" walk "$out/a"'
 claim "neural: refused: a key" 'refused "neural.lipschitz.weigth: no such key; did you mean \"weight\"" train "$out/a" --set neural.lipschitz.weigth=1'
 claim "neural: refused: a value" 'refused "neural.r is 0, expected a whole number" train "$out/a" --set neural.r=0'
 claim "neural: refused: low above high" 'refused "low <= high" train "$out/a" --set "neural.script.handles.0.rotate=[[1,0,0],[0,0,0]]"'
@@ -68,4 +79,5 @@ claim "neural: refused: contact" 'refused "contact.enabled is true, expected fal
 claim "neural: refused: an integrator" 'refused "expected \"quasistatic\" or \"euler\"" train "$out/a" --set world.integrator=bdf2'
 claim "neural: refused: frames of another script" 'refused "frames of another scene" train "$out/a" --set neural.script.seed=2'
 claim "neural: refused: another network" 'refused "a network of another scene" evaluate "$out/a" --set neural.hidden=[17]'
+claim "neural: refused: a bridge from nothing" 'refused "tss neural train" bridge "$out/a" --seed 7'
 claim "neural: refused: not trained" 'refused "tss neural train" evaluate "$out/a" --seed 7'
