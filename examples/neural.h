@@ -34,7 +34,10 @@
    and L_C therefore the share of the motion that is missed.                                       */
 
 #define NEURAL_SNAPSHOTS 400  // frames whose Gram matrix is taken apart
-#define NEURAL_SAMPLES 48     // frames of the estimate of Eq. 7 while training
+#define NEURAL_SAMPLES 48     // frames of the estimate of Eq. 7 while training;
+#define NEURAL_FEW 8          // where it takes more than so many cells, fewer: exact Hessians of
+#define NEURAL_MANY 10000     // 50,000 cells at r 65 take two seconds each
+#define NEURAL_SHARE 0.1      // and no estimate while they have taken more than this share of the phase
 
 typedef enum neural_phase { NEURAL_BASE, NEURAL_VANILLA, NEURAL_LIPSCHITZ } neural_phase;
 static const char *const neural_phases[] = {"base", "vanilla", "lipschitz"};
@@ -1035,7 +1038,7 @@ typedef struct neural_trainer {
     double *g, *c, *c2, *z, *z_bar, *z_mean, *probe, *z_test, *pin;
     int *drawn;  // frames of c2
     double loss, lipschitz, lip, rate;  // running means of the losses
-    double seconds;
+    double seconds, estimating;  // of the phase; of this run, in estimates
     int skipped;
     FILE *rows;
 } neural_trainer;
@@ -1252,7 +1255,11 @@ static int neural_checkpoint(neural_trainer *t) {
     char path[700];
     double *z = neural_z(v, &t->m, t->phase, t->z_test, NEURAL_SAMPLES), *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     const tss_elements *e = v->cubature ? v->cubature : v->elements;
-    (void)neural_eq7(v, &t->m, e, 1, 2, NEURAL_SAMPLES, t->z_test, z, &t->lip);
+    int count = !v->cubature && v->cells > NEURAL_MANY ? NEURAL_FEW : NEURAL_SAMPLES;
+    double began = now(NULL);
+    if (t->m.step == t->last || t->estimating <= NEURAL_SHARE * t->seconds)
+        (void)neural_eq7(v, &t->m, e, 1, 2, count, t->z_test, z, &t->lip);
+    t->estimating += now(NULL) - began;
     fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
             t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped);
     fflush(t->rows), free(z), free(mean);
