@@ -1627,8 +1627,10 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     double *x = neural_spread(v, v->test, v->tests, count < v->tests || v->d->unsupervised ? count : v->tests);
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
     double *z = neural_z(v, &e->m, e == &t->e[NEURAL_TRIAL_LIPSCHITZ] ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, x, count);
-    tss_result r = neural_eq7(v, &e->m, v->elements, 0, 2, count, x, z, &e->lip_decoder);
+    tss_result r = TSS_OK;
     for (int o = 0; o < 3 && r == TSS_OK; o++) r = neural_eq7(v, &e->m, v->elements, 1, o, count, x, z, &e->lip[o]);
+    e->lip_decoder = e->lip[2];
+    if (v->pinned && r == TSS_OK) r = neural_eq7(v, &e->m, v->elements, 0, 2, count, x, z, &e->lip_decoder);
     double *mean = (double *)need((size_t)v->d->r, sizeof *mean);
     e->z_scale = neural_z_scale(z, count, v->d->r, mean);
     free(x), free(z), free(mean);
