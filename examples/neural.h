@@ -22,7 +22,8 @@
            seconds spent.
    run     the test sequences in full space and in each subspace: steps_N.csv, pictures, report.html
    evaluate the same, and Eq. 7 and projections of the test's states: a row a method is appended to
-           DIR/evaluate.csv. --steps N: the first N of each sequence. --no-full: full space is what frames.bin has, not run and timed again
+           DIR/evaluate.csv. --steps N: the first N of each sequence. --no-full: full space is what
+           frames.bin has, not run and timed again
 
    measure what the cubature misses on the base, and what a training step costs: a row to
            DIR/measure.csv
@@ -34,10 +35,10 @@
    and L_C therefore the share of the motion that is missed.                                       */
 
 #define NEURAL_SNAPSHOTS 400  // frames whose Gram matrix is taken apart
-#define NEURAL_SAMPLES 48     // frames of the estimate of Eq. 7 while training;
-#define NEURAL_FEW 8          // where it takes more than so many cells, fewer: exact Hessians of
-#define NEURAL_MANY 10000     // 50,000 cells at r 65 take two seconds each
-#define NEURAL_SHARE 0.1      // and no estimate while they have taken more than this share of the phase
+#define NEURAL_SAMPLES 48     // frames of the estimate of Eq. 7 while training
+#define NEURAL_FEW 8          // the same with more than NEURAL_MANY cells: at 50,000 and r 65 the
+#define NEURAL_MANY 10000     // exact Hessian of one frame takes two seconds
+#define NEURAL_SHARE 0.1      // none while estimates have taken more than this share of a phase
 
 typedef enum neural_phase { NEURAL_BASE, NEURAL_VANILLA, NEURAL_LIPSCHITZ } neural_phase;
 static const char *const neural_phases[] = {"base", "vanilla", "lipschitz"};
@@ -1001,7 +1002,7 @@ static int neural_whitening(neural *v, const tss_model *base) {
     if (!v->d->lipschitz.whiten || v->T) return 1;
     double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, base, NEURAL_BASE, x, count);
     double *A = (double *)need(2 * rr, sizeof *A), *E = A + rr, most = 0;
-    if (!neural_mean_hessian(v, base, count, x, z, A)) return 0;
+    if (!neural_mean_hessian(v, base, count, x, z, A)) return free(x), free(z), free(A), 0;
     v->T = (double *)need(rr, sizeof *v->T), v->S = (double *)need(rr, sizeof *v->S);
     neural_jacobi(r, A, E);
     for (int q = 0; q < r; q++) most = fmax(most, A[q * (r + 1)]);
