@@ -3681,8 +3681,8 @@ static int tss__n_invert(int r, double *A, double *R) {
 }
 
 tss_result tss_model_change_z(tss_model *m, const double *T) {
-    tss_net *dec = m->decoder, *enc = m->encoder;
-    if (!dec || dec->has_in || dec->width[0] > 4096 || (enc && (enc->map != TSS__MAP_NONE || enc->outputs != dec->width[0])))
+    tss_net *dec = m ? m->decoder : NULL, *enc = m ? m->encoder : NULL;
+    if (!dec || !T || dec->has_in || dec->width[0] > 4096 || (enc && (enc->map != TSS__MAP_NONE || enc->outputs != dec->width[0])))
         return TSS_ERROR_BAD_ARGUMENT;
     int r = dec->width[0], w = dec->width[1];
     size_t rr = (size_t)(r * r), bytes = (2 * rr + (size_t)r) * sizeof(double);

@@ -1350,13 +1350,18 @@ typedef struct neural_trial {
     struct neural_bridges *bridges;  // NULL: none
 } neural_trial;
 
-// The best r modes of the frames.
+// The best r modes of the frames, n × r.
+static double *neural_best_modes(const neural *v) {
+    size_t r = (size_t)v->d->r, n = (size_t)v->n;
+    double *B = (double *)need(n * r, sizeof *B);
+    for (size_t j = 0; j < n; j++) memcpy(B + j * r, v->B + j * (size_t)v->p, r * sizeof *B);
+    return B;
+}
+
 static int neural_linear(neural *v, tss_model *m) {
     int r = v->d->r, width[2] = {r, r};
-    double *B = (double *)need((size_t)v->n * (size_t)r, sizeof *B);
+    double *B = neural_best_modes(v);
     tss_net_def d = tss_net_def_default();
-    for (int j = 0; j < v->n; j++)
-        for (int k = 0; k < r; k++) B[j * r + k] = v->B[(size_t)j * (size_t)v->p + (size_t)k];
     d.layers = 1, d.width = width, d.outputs = v->n, d.out_base = v->x0, d.out_matrix = B;
     tss_result e = tss_net_create(NULL, &d, &m->decoder);
     free(B);
@@ -1776,7 +1781,7 @@ static int neural_bridge_basis(neural_bridge_entry *e) {
     neural_trial *t = e->t;
     neural *v = t->v;
     int r = v->d->r;
-    double *B = (double *)need((size_t)v->n * (size_t)r, sizeof *B);
+    double *B = NULL;
     tss_basis_def d = tss_basis_eigen(r);
     tss_basis_info info;
     tss_basis id;
@@ -1785,8 +1790,7 @@ static int neural_bridge_basis(neural_bridge_entry *e) {
     if (kind == NEURAL_BRIDGE_SKINNING) {
         d = tss_basis_skinning(neural_bridge_handles(v)), d.initial = -1;
     } else if (kind == NEURAL_BRIDGE_LINEAR) {
-        for (int j = 0; j < v->n; j++)
-            for (int k = 0; k < r; k++) B[j * r + k] = v->B[(size_t)j * (size_t)v->p + (size_t)k];
+        B = neural_best_modes(v);
         d = tss_basis_arrays(r, NULL, B, NULL);
     } else if (kind == NEURAL_BRIDGE_TANGENT) {
         const tss_model *m = &t->e[neural_bridge_bases[e->basis].model].m;

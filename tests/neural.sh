@@ -19,6 +19,9 @@ claim "neural: evaluates" 'tss evaluate "$out/a" >>"$build/neural.log" 2>&1'
 claim "neural: evaluates without full space" 'e=$(value lipschitz simulation_error); tss evaluate "$out/a" --no-full >>"$build/neural.log" 2>&1 &&
     [ "$(value lipschitz simulation_error)" = "$e
 $e" ] && [ "$(grep -c ",full," "$out/a/evaluate.csv")" = 1 ] && sed -i "7,\$d" "$out/a/evaluate.csv"'
+claim "neural: the first steps of the tests" 'tss evaluate "$out/a" --no-full --steps 3 >>"$build/neural.log" 2>&1 &&
+    sed -n 7p "$out/a/evaluate.csv" | grep -q "test steps 3," && sed -i "7,\$d" "$out/a/evaluate.csv"'
+claim "neural: refused: --no-full elsewhere" '! tss run "$out/a" --no-full 2>"$build/neural_bad.log" && grep -q "no-full.*evaluate" "$build/neural_bad.log"'
 claim "neural: runs" 'tss run "$out/a" >>"$build/neural.log" 2>&1'
 claim "neural: the header is the documented one" \
     'grep -q "^system,method,seed,dof,elements,r,step_ms,iterations,evaluations,exit_converged,exit_saddle,exit_line,exit_iterations,gradient,lip,projection_error,simulation_error,train_seconds" "$out/a/evaluate.csv"'

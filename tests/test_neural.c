@@ -1029,6 +1029,7 @@ static void test_change_z(void **state) {
     tss_net_forward(m.decoder, s.work, B, z, x), tss_net_forward(m.encoder, s.work, B, data, code[0]);
     tss_reduced_potential_held(m.decoder, s.e, s.work, NULL, B, z, NULL, NULL, H[0]);
     assert_int_equal(tss_model_change_z(&m, flat), TSS_ERROR_BAD_ARGUMENT);
+    assert_int_equal(tss_model_change_z(&m, NULL), TSS_ERROR_BAD_ARGUMENT);
     tss_net_forward(m.decoder, s.work, B, z, x2);
     assert_memory_equal(x, x2, (size_t)(B * s.coords) * sizeof *x);
     assert_int_equal(tss_model_change_z(&m, T), TSS_OK);
