@@ -393,6 +393,12 @@ static int neural_open(run *r, neural *v) {
     if (v->d->lipschitz.probes > v->d->r)
         return fail(r, "%s: neural.lipschitz.probes is %d, expected at most neural.r (%d)", r->o.scene,
                     v->d->lipschitz.probes, v->d->r);
+    if (v->d->train.start && v->d->unsupervised)
+        return fail(r, "%s: neural.train.start is \"linear\", expected \"random\" where nothing is supervised", r->o.scene);
+    for (int k = 0; v->d->train.start && k < v->d->layers; k++)
+        if (v->d->hidden[k] < v->d->r)
+            return fail(r, "%s: neural.hidden[%d] is %d, expected at least neural.r (%d) with train.start \"linear\"", r->o.scene, k,
+                        v->d->hidden[k], v->d->r);
     if (v->d->lipschitz.window && v->d->lipschitz.batch % 4)
         return fail(v->r, "%s: neural.lipschitz.batch is %d, expected a multiple of 4 with window", v->r->o.scene,
                     v->d->lipschitz.batch);
@@ -822,6 +828,33 @@ static int neural_net(neural *v, int in, int out, uint64_t seed, const tss_net_d
     return tss_net_create(NULL, &d, net) == TSS_OK ? 1 : fail(v->r, "%s: neural.hidden: out of memory", v->r->o.scene);
 }
 
+#define NEURAL_BIAS 6  // spreads of z within which a unit that passes it on stays on its straight side
+
+// train.start linear: units k < r of every layer pass on number k, plus NEURAL_BIAS between the layers,
+// where σ(s) = s (ELU; the smooth ones nearly); the others begin at random and go to no output yet.
+// unit: what the first layer divides by; NULL: 1.
+static void neural_pass_on(int r, tss_net *net, const double *unit) {
+    tss_net_info info;
+    tss_net_get_info(net, &info);
+    double *W = tss_net_parameters(net);
+    for (int l = 0; l < info.layers; l++) {
+        int in = info.width[l], out = info.width[l + 1], last = l + 1 == info.layers;
+        double *b = W + (size_t)in * (size_t)out;
+        for (int o = 0; o < out; o++) {
+            int passed = o < r || last;
+            for (int k = 0; k < in; k++) {
+                double *w = W + (size_t)k * (size_t)out + o;
+                if (passed)
+                    *w = k == o && o < r ? (unit && l == 0 ? 1 / unit[k] : 1) : 0;
+                else if (l > 0 && k < r)
+                    b[o] -= NEURAL_BIAS * *w;
+            }
+            if (passed) b[o] = o < r ? NEURAL_BIAS * ((l == 0) - last) : 0;
+        }
+        W = b + out;
+    }
+}
+
 // The free coordinates that an unsupervised decoder moves. Returns how many.
 static int neural_free(const neural *v, int *index) {
     int n = 0;
@@ -847,7 +880,9 @@ static int neural_fresh(neural *v, tss_model *m) {
     if (!neural_net(v, v->d->r, v->p, seed, &d, &m->decoder)) return 0;
     d = tss_net_def_default();
     d.inputs = v->n, d.in_base = v->x0, d.in_matrix = v->A;
-    return neural_net(v, v->p, v->d->r, seed + 1, &d, &m->encoder);
+    if (!neural_net(v, v->p, v->d->r, seed + 1, &d, &m->encoder)) return 0;
+    if (v->d->train.start) neural_pass_on(v->d->r, m->decoder, NULL), neural_pass_on(v->d->r, m->encoder, v->unit);
+    return 1;
 }
 
 static size_t neural_parameters(const tss_net *net) {

@@ -123,7 +123,8 @@
      .pulls[]              {lower, upper, metres; force: total, N, each axis within ± this}
     .pca                   {tol: largest distance of a node over the longest side (1e-3), most (300), scale (false)}
     .train                 vanilla: {steps (20000), batch (64), rate (1e-3), rate_end (1e-5), warmup
-                           (0), lambda (1), sigma (1), eps (1e-8), ramp (0)}
+                           (0), lambda (1), sigma (1), eps (1e-8), ramp (0), start: random | linear,
+                           supervised: the networks begin as the r best modes (random)}
     .lipschitz             {steps (5000), weight (1e-3), batch (16), rate (1e-4), rate_end (1e-6),
                            warmup (0), order (2), estimator: exact | uv | u (u), probes (1), undivided
                            (false), through_encoder (true), relative: L_LS in units
@@ -263,7 +264,7 @@ typedef struct scene_neural {
         int most, scale;
     } pca;
     struct {
-        int steps, batch, warmup, ramp;
+        int steps, batch, warmup, ramp, start;
         double rate, rate_end, lambda, sigma, eps;
     } train;
     struct {
@@ -1715,6 +1716,7 @@ static int scene__read_bodies(scene__reader *r, const cJSON *v, void *base) {
 // ---------------------------------------------------------------------------------------------
 
 static const char *const scene__systems[] = {"supervised", "unsupervised", NULL};
+static const char *const scene__net_starts[] = {"random", "linear", NULL};
 static const char *const scene__activations[] = {"elu", "silu", "softplus", "gelu", NULL};
 static const char *const scene__estimators[] = {"exact", "uv", "u", NULL};
 static const char *const scene__reduced_solvers[] = {"lbfgs", "newton", NULL};
@@ -1847,6 +1849,7 @@ static const scene__key scene__pca_keys[] = {
     SCENE__POS(scene_neural, pca.tol, "tol"), SCENE__INT(scene_neural, pca.most, "most", 1, 2000),
     SCENE__OF(SCENE__FLAG, scene_neural, pca.scale, "scale"), SCENE__END};
 static const scene__key scene__train_keys[] = {
+    SCENE__ONE(scene_neural, train.start, "start", scene__net_starts),
     SCENE__INT(scene_neural, train.steps, "steps", 1, 1e9),
     SCENE__INT(scene_neural, train.batch, "batch", 2, 1e5),
     SCENE__POS(scene_neural, train.rate, "rate"),

@@ -42,6 +42,15 @@ done
 lip() { awk -F, '$1 == "base" {print $6; exit}' "$out/$1/train_0.csv"; }
 claim "neural: modes in units of their own" 'tss train "$out/scaled" --set neural.pca.scale=true --method vanilla >"$build/neural_scaled.log" 2>&1 &&
     less "$(lip scaled)" "$(lip a)"'
+# train.start linear: a decoder that has not been trained is the linear subspace, which tss_reduced has without a network.
+still="--set neural.train.start=linear --set neural.pca.scale=true --set neural.train.steps=1 --set neural.train.rate=1e-12 --set neural.train.rate_end=1e-12
+    --set neural.lipschitz.steps=1 --set neural.lipschitz.rate=1e-12 --set neural.lipschitz.rate_end=1e-12 --set neural.solver.ftol=0 --set neural.solver.eps=1e-7"
+of() { awk -F, -v m="$1" -v c="$2" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == m {print $k}' "$out/l/evaluate.csv"; }
+near() { awk -v a="$1" -v b="$2" -v d="$3" 'BEGIN {exit !(a > 0 && a < (1 + d) * b && b < (1 + d) * a)}'; }
+# shellcheck disable=SC2086
+claim "neural: networks begin as the linear subspace" 'tss train "$out/l" $still >"$build/neural_l.log" 2>&1 && tss evaluate "$out/l" $still --no-full >>"$build/neural_l.log" 2>&1 &&
+    near "$(of vanilla projection_error)" "$(of linear projection_error)" 1e-4 && near "$(of vanilla simulation_error)" "$(of linear simulation_error)" 1e-3 &&
+    near "$(of vanilla energy)" "$(of linear energy)" 1e-4'
 claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
     "$build/tss" neural evaluate examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
@@ -78,6 +87,7 @@ claim "neural: refused: a ball that meets no shell" 'refused "expected a first b
 claim "neural: refused: another action" 'refused "expected train, run, evaluate, measure or bridge" walk "$out/a"'
 claim "neural: refused: a key" 'refused "neural.lipschitz.weigth: no such key; did you mean \"weight\"" train "$out/a" --set neural.lipschitz.weigth=1'
 claim "neural: refused: a value" 'refused "neural.r is 0, expected a whole number" train "$out/a" --set neural.r=0'
+claim "neural: refused: too narrow to begin linear" 'refused "neural.hidden\[0\] is 3, expected at least neural.r (4)" train "$out/a" --set neural.train.start=linear --set neural.hidden=[3]'
 claim "neural: refused: low above high" 'refused "low <= high" train "$out/a" --set "neural.script.handles.0.rotate=[[1,0,0],[0,0,0]]"'
 claim "neural: refused: contact" 'refused "contact.enabled is true, expected false" train "$out/a" --set contact.enabled=true'
 claim "neural: refused: an integrator" 'refused "expected \"quasistatic\" or \"euler\"" train "$out/a" --set world.integrator=bdf2'
