@@ -1074,6 +1074,7 @@ typedef struct neural_trainer {
     double *g, *c, *c2, *z, *z_bar, *z_mean, *probe, *z_test, *pin;
     int *drawn;  // frames of c2
     double loss, lipschitz, lip, rate;  // running means of the losses
+    double loss_test;                   // L_C of the test frames at the last checkpoint
     double seconds, estimating;  // of the phase; of this run, in estimates
     int skipped;
     FILE *rows;
@@ -1249,7 +1250,7 @@ static int neural_rows_open(neural_trainer *t) {
     int old = access(path, F_OK) == 0;
     t->rows = fopen(path, "a");
     if (!t->rows) return fail(t->v->r, "%s: cannot be written: %s", path, strerror(errno));
-    if (!old) fputs("phase,step,seconds,loss,loss_lipschitz,lip,z_scale,rate,skipped\n", t->rows);
+    if (!old) fputs("phase,step,seconds,loss,loss_lipschitz,lip,z_scale,rate,skipped,loss_test\n", t->rows);
     return 1;
 }
 
@@ -1285,6 +1286,14 @@ static void neural_trainer_close(neural_trainer *t) {
     if (t->rows) fclose(t->rows);
 }
 
+// L_C of the test frames; unsupervised: 0, its samples are never the same ones.
+static double neural_test_loss(const neural_trainer *t) {
+    double loss = 0;
+    if (t->encoder && tss_loss_reconstruction(t->decoder, t->encoder, t->v->work, NULL, t->v->tests, t->v->code_test, 1, &loss, NULL, NULL) != TSS_OK)
+        loss = 0;
+    return loss;
+}
+
 // The model to its file, and a row of the curves.
 static int neural_checkpoint(neural_trainer *t) {
     neural *v = t->v;
@@ -1296,8 +1305,9 @@ static int neural_checkpoint(neural_trainer *t) {
     if (t->m.step == t->last || t->estimating <= NEURAL_SHARE * t->seconds)
         (void)neural_eq7(v, &t->m, e, 1, 2, count, t->z_test, z, &t->lip);
     t->estimating += now(NULL) - began;
-    fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d\n", neural_phases[t->phase], (unsigned long long)t->m.step,
-            t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped);
+    t->loss_test = neural_test_loss(t);
+    fprintf(t->rows, "%s,%llu,%.1f,%.6g,%.6g,%.6g,%.6g,%.6g,%d,%.6g\n", neural_phases[t->phase], (unsigned long long)t->m.step,
+            t->seconds, t->loss, t->lipschitz, t->lip, neural_z_scale(z, NEURAL_SAMPLES, v->d->r, mean), t->rate, t->skipped, t->loss_test);
     fflush(t->rows), free(z), free(mean);
     neural_path(v, t->phase, path);
     tss_result r = tss_model_write(NULL, &t->m, path);
@@ -1333,7 +1343,8 @@ static int neural_train_phase(neural *v, neural_phase phase) {
     neural_trainer t;
     int ok = neural_trainer_open(v, phase, &t) && neural_train_loop(&t);
     if (ok && t.loss > 0)
-        printf("%s: step %llu, %.1f s, loss %.6g, Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds, t.loss, t.lip);
+        printf("%s: step %llu, %.1f s, loss %.6g (test frames: %.6g), Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds,
+               t.loss, t.loss_test, t.lip);
     fflush(stdout);
     neural_trainer_close(&t);
     return ok;
