@@ -7,6 +7,7 @@
 # test sequence only the first STEPS (for the large systems, whose steps take seconds).
 #   part     file                  system (unless -s)    paper B
 #   methods  neural.csv            all small; also -s twist_bar, cloth, dinosaur, elephant, bunny   Table 1: vanilla, lipschitz, linear, full
+#            neural_errors.csv     as neural.csv         deciles of the errors (also by the part errors, from trained models)
 #   newton   neural_newton.csv     all small             Table 4: projected Newton
 #   eps      neural_eps.csv        twist, pulled, bist.  Table 2: eps 1e-4, 1e-5, 1e-6
 #   order    neural_order.csv      twist, pulled         Table 3: L_LS of order 0, 1, 2
@@ -108,7 +109,7 @@ variant() {
 rows() {
     action=$1 file=$2 system=$3 dir=$4 seed=$5; shift 5
     left >/dev/null || exit 3
-    csv=$dir/$action.csv; rm -f "$csv"
+    csv=$dir/$action.csv; rm -f "$csv" "$dir/errors.csv"
     again="--repeat $repeat ${steps:+--steps $steps}"; [ "$action" != measure ] || again=
     # shellcheck disable=SC2086
     tss "$action" "$system" "$dir" "$seed" $again "$@" && add "$csv" "$file" && echo "$system, seed $seed: $file $*"
@@ -116,7 +117,15 @@ rows() {
 
 methods() {
     there neural.csv system="$1" seed="$2" && return
-    train "$1" "$2" && rows evaluate neural.csv "$1" "$work/$1" "$2"
+    train "$1" "$2" && rows evaluate neural.csv "$1" "$work/$1" "$2" && add "$work/$1/errors.csv" neural_errors.csv
+}
+
+errors() {
+    there neural_errors.csv system="$1" seed="$2" && return
+    train "$1" "$2" || return
+    rm -f "$work/$1/errors.csv"
+    # shellcheck disable=SC2086
+    tss evaluate "$1" "$work/$1" "$2" --no-full ${steps:+--steps $steps} && add "$work/$1/errors.csv" neural_errors.csv && echo "$1, seed $2: neural_errors.csv"
 }
 
 newton() {
@@ -200,12 +209,12 @@ bridge() {
 
 for part in $parts; do
     case $part in
-    methods | newton) these=${systems:-twist_bar_small pulled_bar bistable dinosaur_small} ;;
+    methods | newton | errors) these=${systems:-twist_bar_small pulled_bar bistable dinosaur_small} ;;
     eps) these=${systems:-twist_bar_small pulled_bar bistable} ;;
     order | runtime | cubature | cost) these=${systems:-twist_bar_small pulled_bar} ;;
     r) these=${systems:-pulled_bar} ;;
     bridge) these=${systems:-twist_bar_small pulled_bar dinosaur_small} ;;
-    *) echo "$part: no such part (methods newton eps order runtime cubature cost r bridge)" >&2; exit 2 ;;
+    *) echo "$part: no such part (methods errors newton eps order runtime cubature cost r bridge)" >&2; exit 2 ;;
     esac
     for n in $seeds; do for s in $these; do $part "$s" "$n"; done; done
 done

@@ -716,6 +716,31 @@ static int neural_new_system(const curves_table *t, int row) {
     return 1;
 }
 
+enum { PERCENT = SEED + 1, E_SIMULATION, E_SIMULATION_FARTHEST, E_PROJECTION, E_PROJECTION_FARTHEST };
+
+static const char *const errors_header =
+    "system,method,seed,percent,simulation,simulation_farthest,projection,projection_farthest";
+
+static void neural_distributions(source *s, report *r) {
+    static const char *const title[4] = {"simulation error", "simulation error, farthest node", "projection error", "projection error, farthest node"};
+    static const char *const method[3] = {"vanilla", "lipschitz", "linear"};
+    char path[700];
+    curves_table t;
+    report_heading(r, "Distributions of the errors");
+    if (!open_table(s, r, "neural_errors.csv", errors_header, neural_command, &t, path)) return;
+    report_text(r, "Below which error a share of the states are: of each test step, and of every fourth test state's projection. "
+                   "Means over seeds of their deciles, over the diagonal of the rest shape.");
+    report_columns_begin(r);
+    for (int i = 0; i < t.rows; i++)
+        for (int k = 0; neural_new_system(&t, i) && k < 4; k++) {
+            neural_line line[3];
+            for (int m = 0; m < 3; m++) line[m].name = line[m].word = method[m], line[m].column = E_SIMULATION + k, line[m].filter = METHOD;
+            neural_plot(r, &t, curves_cell(&t, i, SYSTEM), title[k], PERCENT, "% of states", "over the diagonal", line, 3);
+        }
+    report_columns_end(r);
+    curves_table_free(&t);
+}
+
 static void neural_dimension(source *s, report *r) {
     static const neural_line lines[3][2] = {
         {{"vanilla", PROJECTION, METHOD, "vanilla"}, {"lipschitz", PROJECTION, METHOD, "lipschitz"}},
@@ -813,6 +838,7 @@ static void page_neural(source *s, report *r) {
     static const neural_column runtime[] = {{"step, ms", STEP_MS, 0}, {"evaluations", EVALUATIONS, 0},
         {"simulation error", SIMULATION, 0}};
     neural_methods(s, r);
+    neural_distributions(s, r);
     neural_section(s, r, "Projected Newton (Table 4)", "The same decoders, each step by projected Newton.",
                    "neural_newton.csv", -1, NULL, newton, 4);
     neural_section(s, r, "When to stop (Table 2)",

@@ -1384,6 +1384,8 @@ typedef struct neural_entry {
     int *iterations, *evaluations, *exit;
     // Distance of the tests' states from the nearest that the decoder reaches, over the diagonal.
     double projection_mean, projection_farthest;
+    double *projected, *projected_farthest;  // of each such state
+    int projections;
     double lip[3], lip_decoder, z_scale, train_seconds;  // Eq. 7 and its orders 0 and 1 (Eq. 12), with handles; without; spread of z: lip · spread³ does not see z stretched
 } neural_entry;
 
@@ -1497,7 +1499,7 @@ static int neural_trial_open(neural *v, neural_trial *t) {
 static void neural_trial_close(neural_trial *t) {
     for (int k = 0; k < NEURAL_TRIALS; k++) {
         tss_reduced_destroy(t->e[k].s), tss_model_free(&t->e[k].m), tss_elements_destroy(t->e[k].cells);
-        free(t->e[k].seconds), free(t->e[k].iterations);
+        free(t->e[k].seconds), free(t->e[k].iterations), free(t->e[k].projected);
     }
     free(t->room);
 }
@@ -1656,19 +1658,20 @@ static void neural_table(const neural_trial *t) {
 // Every fourth state of the tests.
 static int neural_project(neural_trial *t, neural_entry *e) {
     neural *v = t->v;
-    int count = 0;
+    int *count = &e->projections;
+    e->projected = (double *)need(2 * (size_t)v->tests, sizeof(double)), e->projected_farthest = e->projected + v->tests;
     (void)tss_reduced_set_handles(e->s, 0, NULL, NULL);
-    for (int f = 0; f < v->tests; f += 4, count++) {
-        double mean, most;
+    for (int f = 0; f < v->tests; f += 4, ++*count) {
+        double *mean = &e->projected[*count], *most = &e->projected_farthest[*count];
         const double *x = v->test + (size_t)f * (size_t)v->n;
         double *z = e->m.encoder ? neural_z(v, &e->m, NEURAL_VANILLA, x, 1) : NULL;
         if (z) (void)tss_reduced_set(e->s, z);
         free(z);
         if (tss_reduced_project(e->s, x, NULL) != TSS_OK) return fail(v->r, "%s: test state %d cannot be projected", v->r->o.scene, f);
-        neural_distance(t, tss_reduced_x(e->s), x, &mean, &most);
-        e->projection_mean += mean, e->projection_farthest = fmax(e->projection_farthest, most);
+        neural_distance(t, tss_reduced_x(e->s), x, mean, most);
+        e->projection_mean += *mean, e->projection_farthest = fmax(e->projection_farthest, *most);
     }
-    e->projection_mean /= count;
+    e->projection_mean /= *count;
     return 1;
 }
 
@@ -1733,6 +1736,41 @@ static int neural_rows(neural_trial *t) {
     return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
 }
 
+static int neural_ascending(const void *a, const void *b) {
+    double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+// Value q of 10 of n numbers in ascending order, linear between them (0: the least, 10: the largest).
+static double neural_decile(const double *x, int n, int q) {
+    double at = q * (n - 1) / 10.0;
+    int k = at >= n - 1 ? n - 1 : (int)at;
+    return x[k] + (k < n - 1 ? (at - k) * (x[k + 1] - x[k]) : 0);
+}
+
+// DIR/errors.csv: the distributions of what evaluate.csv has the means of, over states.
+static int neural_errors(neural_trial *t) {
+    neural *v = t->v;
+    char path[700], name[120];
+    snprintf(path, sizeof path, "%s/errors.csv", v->r->o.out);
+    int old = access(path, F_OK) == 0;
+    FILE *f = fopen(path, "a");
+    if (!f) return fail(v->r, "%s: cannot be written: %s", path, strerror(errno));
+    if (!old) fputs("system,method,seed,percent,simulation,simulation_farthest,projection,projection_farthest\n", f);
+    for (int k = 0; k < NEURAL_TRIAL_FULL; k++) {
+        neural_entry *e = &t->e[k];
+        double *of[] = {e->mean, e->farthest, e->projected, e->projected_farthest};
+        int n[] = {t->steps, t->steps, e->projections, e->projections};
+        for (int i = 0; e->used && i < 4; i++) qsort(of[i], (size_t)n[i], sizeof(double), neural_ascending);
+        for (int q = 0; e->used && q <= 10; q++) {
+            fprintf(f, "%s,%s,%d,%d", sweep_name(v->r, name), neural_trial_names[k], v->r->o.seed, 10 * q);
+            for (int i = 0; i < 4; i++) fprintf(f, ",%.6g", neural_decile(of[i], n[i], q));
+            fputc('\n', f);
+        }
+    }
+    return fclose(f) == 0 ? 1 : fail(v->r, "%s: cannot be written", path);
+}
+
 static int neural_evaluate(neural *v) {
     neural_trial t;
     int ok = neural_trial_open(v, &t) && neural_trial_run(&t, NULL, NULL);
@@ -1747,7 +1785,7 @@ static int neural_evaluate(neural *v) {
                neural_mean_of(a->evaluations, t.steps) / neural_mean_of(b->evaluations, t.steps), a->lip[2] / b->lip[2],
                a->lip[2] * pow(a->z_scale, 3) / (b->lip[2] * pow(b->z_scale, 3)), a->lip_decoder / b->lip_decoder,
                b->projection_mean / a->projection_mean, neural_mean(b->mean, t.steps) / neural_mean(a->mean, t.steps));
-        ok = neural_rows(&t);
+        ok = neural_rows(&t) && neural_errors(&t);
     }
     neural_trial_close(&t);
     return ok;

@@ -28,6 +28,11 @@ claim "neural: the header is the documented one" \
 claim "neural: the machine is named" 'head -1 "$out/a/evaluate.csv" | grep -q "^# .*, threads "'
 claim "neural: a row a method" '[ "$(grep -c "^neural_twist_bar_small," "$out/a/evaluate.csv")" = 4 ]'
 claim "neural: L_LS lowers Eq. 7" 'less "$(value lipschitz lip)" "$(value vanilla lip)"'
+# errors METHOD PERCENT COLUMN
+errors() { awk -F, -v m="$1" -v p="$2" -v c="$3" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == m && $4 == p {print $k; exit}' "$out/a/errors.csv"; }
+claim "neural: distributions: the farthest node of evaluate.csv is the last decile" '[ "$(errors lipschitz 100 simulation_farthest)" = "$(value lipschitz simulation_max)" ] &&
+    [ "$(errors vanilla 100 projection_farthest)" = "$(value vanilla projection_max)" ] && less "$(errors linear 0 simulation)" "$(value linear simulation_error)" &&
+    less "$(value linear simulation_error)" "$(errors linear 100 simulation)"'
 claim "neural: full space is its own reference" '[ "$(value full simulation_error)" = 0 ]'
 claim "neural: a row a step and method" '[ "$(grep -c "^0," "$out/a/steps_0.csv")" = 80 ]'
 claim "neural: pictures and a page" '[ -s "$out/a/states_0.png" ] && [ -s "$out/a/report.html" ]'

@@ -366,6 +366,7 @@ static void neural_files(void) {
     write_file("small/neural_cost.csv", measure_header,
                MEASURE_ROW("bar <1>", "4", "150", "u") MEASURE_ROW("bar <1>", "8", "150", "u")
                MEASURE_ROW("bar <1>", "4", "150", "exact") MEASURE_ROW("bar <1>", "8", "150", "exact"));
+    write_file("small/neural_errors.csv", errors_header, "bar <1>,vanilla,0,0,0.01,0.1,0.002,0.02\nbar <1>,vanilla,0,100,0.04,0.4,0.008,0.08\n");
     write_file("small/neural_bridge.csv", bridge_header, "bar <1>,skinning,0,12,on,7.5,5.6,18.6,55.6,171,0,0,0.00287,0.0369,0,567,400,300,0.5,1e-4,0.01\n");
 }
 
@@ -386,6 +387,7 @@ static void test_neural(void **state) {
     char *h = page("neural.html");
     has(h, "2.00 times vanilla&#39;s speed"), has(h, "bar &lt;1&gt;"), has(h, "<td class=\"n good\">2</td>");
     has(h, "mean exit gradient"), has(h, ">75</td>"), has(h, "a step of training"), has(h, "relative errors");
+    has(h, "Distributions of the errors"), has(h, "projection error, farthest node"), has(h, "% of states");
     has(h, "projection error"), has(h, "exact L_LS, cubature"), has(h, "nodes added a step"), has(h, ">skinning<");
     free(h);
     write_file("small/neural.csv", neural_header, "bar,vanilla,0\n");
