@@ -992,6 +992,20 @@ static int neural_cubature(neural *v, const tss_model *base, neural_phase phase,
     return ok;
 }
 
+// The reduced solver of the scene with a decoder; cells NULL: all.
+static tss_reduced_def neural_solver(neural *v, const tss_net *decoder, const tss_elements *cells) {
+    const scene_neural *d = v->d;
+    tss_reduced_def rd = tss_reduced_def_default();
+    rd.decoder = decoder, rd.elements = cells ? cells : v->elements, rd.mass = v->mass, rd.h = v->h;
+    if (v->ball.radius > 0) {
+        rd.sdf = tss_sdf_ball, rd.sdf_user = &v->ball, rd.contact_stiffness = v->ball_stiffness;
+        rd.contact_margin = v->ball_margin, rd.contact_weight = v->area;
+    }
+    rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
+    rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+    return rd;
+}
+
 // ---------------------------------------------------------------------------------------------
 // >>neural_whitening: z = T y, in which the mean of |∇²P| + JᵀMJ/h² over states of the base is the unit
 // matrix (J per unit of y²). The iterations of L-BFGS follow that matrix's condition, which L_LS does not
@@ -1000,22 +1014,48 @@ static int neural_cubature(neural *v, const tss_model *base, neural_phase phase,
 // ---------------------------------------------------------------------------------------------
 
 #define NEURAL_WHITEN_STATES 200
+#define NEURAL_SOLVED 8         // training sequences, and steps of each, whose every other state stands for the solver's
+#define NEURAL_SOLVED_STEPS 6
 #define NEURAL_WHITEN_LEAST 1e-6  // of the largest eigenvalue: directions that move nothing stay finite
 
-// The mean over states z (count × r), r × r, symmetric.
-static int neural_mean_hessian(neural *v, const tss_model *m, int count, const double *x, const double *z, double *mean) {
+// JᵀKJ of the elements at f(z), handles at value; J: r × n, room: 2 n.
+static tss_result neural_tangent_stiffness(neural *v, const tss_model *m, const double *z, const double *value, const double *I, double *J,
+                                           double *room, double *H) {
+    int r = v->d->r;
+    size_t n = (size_t)v->n;
+    double *x = room, *force = room + n, one = 1, slope;
+    tss_result e = tss_net_jets(m->decoder, v->work, 1, r, z, I, NULL, x, J, NULL);
+    for (int i = 0; i < v->pinned; i++) {
+        x[v->pin[i]] = value[i];
+        for (int a = 0; a < r; a++) J[(size_t)a * n + (size_t)v->pin[i]] = 0;
+    }
+    for (int a = 0; a < r && e == TSS_OK; a++) {
+        memset(force, 0, n * sizeof *force);  // K J_a, as the gradient of ∇P·J_a
+        e = tss_elements_jets(v->elements, 1, x, J + (size_t)a * n, NULL, NULL, NULL, &slope, NULL, 0, &one, 0, force, NULL, NULL);
+        for (int b = 0; b < r; b++) {
+            H[a * r + b] = 0;
+            for (size_t j = 0; j < n; j++) H[a * r + b] += J[(size_t)b * n + j] * force[j];
+        }
+    }
+    return e;
+}
+
+// The mean over states z (count × r), r × r, symmetric. tangent: without the curvature of f, which at a
+// solution counts for little: there forces and inertia nearly balance.
+static int neural_mean_hessian(neural *v, const tss_model *m, int tangent, int count, const double *x, const double *z, double *mean) {
     int r = v->d->r, rr = r * r;
     size_t n = (size_t)v->n;
     double *H = (double *)need((size_t)(2 * rr + 2 * r), sizeof *H), *E = H + rr, *g = E + rr, *P = g + r;
     double *J = (double *)need((size_t)r * n, sizeof *J), *value = (double *)need((size_t)v->pinned, sizeof *value);
-    double *I = (double *)need((size_t)rr, sizeof *I);
+    double *I = (double *)need((size_t)rr, sizeof *I), *room = (double *)need(2 * n, sizeof *room);
     tss_held held = {v->pinned, v->pin, value};
     tss_result e = TSS_OK;
     memset(mean, 0, (size_t)rr * sizeof *mean);
     for (int i = 0; i < r; i++) I[i * (r + 1)] = 1;
     for (int k = 0; k < count && e == TSS_OK; k++) {
         if (v->pinned) neural_pinned(v, x + (size_t)k * n, 1, value);
-        e = tss_reduced_potential_held(m->decoder, v->elements, v->work, v->pinned ? &held : NULL, 1, z + k * r, P, g, H);
+        e = tangent ? neural_tangent_stiffness(v, m, z + k * r, value, I, J, room, H)
+                    : tss_reduced_potential_held(m->decoder, v->elements, v->work, v->pinned ? &held : NULL, 1, z + k * r, P, g, H);
         neural_jacobi(r, H, E);
         for (int i = 0; i < r * rr; i++) {
             int q = i / rr, a = i % rr;
@@ -1026,28 +1066,89 @@ static int neural_mean_hessian(neural *v, const tss_model *m, int count, const d
             for (size_t j = 0; j < n; j++)
                 mean[a] += v->mass[j] * J[(size_t)(a / r) * n + j] * J[(size_t)(a % r) * n + j] / (v->h * v->h * count);
     }
-    free(H), free(J), free(value), free(I);
+    free(H), free(J), free(value), free(I), free(room);
     return e == TSS_OK ? 1 : fail(v->r, "%s: whiten: %s", v->r->o.scene, tss_result_text(e));
 }
 
-// v->T and v->S from a base, if they are asked for and not there.
-static int neural_whitening(neural *v, const tss_model *base) {
-    int r = v->d->r, count = NEURAL_WHITEN_STATES;
-    size_t rr = (size_t)(r * r);
-    if (!v->d->lipschitz.whiten || v->T) return 1;
-    double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, base, NEURAL_BASE, x, count);
-    double *A = (double *)need(2 * rr, sizeof *A), *E = A + rr, most = 0;
-    if (!neural_mean_hessian(v, base, count, x, z, A)) return free(x), free(z), free(A), 0;
-    v->T = (double *)need(rr, sizeof *v->T), v->S = (double *)need(rr, sizeof *v->S);
+// T and S (r × r, symmetric) of a mean Hessian A, which is destroyed: Tᵀ A T = 1, S = T⁻¹.
+static void neural_roots(int r, double *A, double *T, double *S) {
+    double *E = (double *)need((size_t)(r * r), sizeof *E), most = 0;
+    memset(T, 0, (size_t)(r * r) * sizeof *T), memset(S, 0, (size_t)(r * r) * sizeof *S);
     neural_jacobi(r, A, E);
     for (int q = 0; q < r; q++) most = fmax(most, A[q * (r + 1)]);
     for (int q = 0; q < r; q++)
         for (int i = 0; i < r * r; i++) {
             double l = sqrt(fmax(A[q * (r + 1)], NEURAL_WHITEN_LEAST * most)), ee = E[q * r + i / r] * E[q * r + i % r];
-            v->T[i] += ee / l, v->S[i] += ee * l;
+            T[i] += ee / l, S[i] += ee * l;
         }
+    free(E);
+}
+
+// C ← A B, r × r.
+static void neural_times(int r, const double *A, const double *B, double *C) {
+    for (int i = 0; i < r * r; i++) {
+        C[i] = 0;
+        for (int k = 0; k < r; k++) C[i] += A[i - i % r + k] * B[k * r + i % r];
+    }
+}
+
+// States in which the solver ends: the first steps of some training sequences. Returns how many, 0: failed.
+static int neural_solved(neural *v, const tss_model *m, double *x, double *z) {
+    tss_reduced_def rd = neural_solver(v, m->decoder, NULL);
+    tss_host host = tss_host_default();
+    tss_reduced *s;
+    size_t n = (size_t)v->n, r = (size_t)v->d->r;
+    double *target = (double *)need((size_t)(v->handles * v->dim), sizeof *target), *force = (double *)need(n, sizeof *force);
+    int steps = v->d->script.length / v->d->script.stride, count = 0, ok = 1;
+    if (steps > NEURAL_SOLVED_STEPS) steps = NEURAL_SOLVED_STEPS;
+    host.log = print_log, host.workers = v->r->o.threads;
+    rd.solver = TSS_LBFGS;
+    if (tss_reduced_create(&host, &rd, &s) != TSS_OK) return free(target), free(force), fail(v->r, "%s: neural.solver is refused", v->r->o.scene);
+    for (int q = 0; ok && q < NEURAL_SOLVED && q < v->d->script.train; q++) {
+        neural_script script = neural_script_of(v, v->d->script.test + q);
+        (void)tss_reduced_set_handles(s, 0, NULL, NULL);
+        ok = tss_reduced_project(s, v->x0, NULL) == TSS_OK;
+        for (int k = 0; ok && k < steps; k++) {
+            int at = v->d->script.stride * (k + 1) - 1;
+            memcpy(v->ball.center, script.center + 3 * at, sizeof v->ball.center);
+            neural_targets(v, &script, at, target), neural_forces(v, &script, at, 1, force);
+            ok = tss_reduced_set_handles(s, v->handles, v->handle, target) == TSS_OK;
+            tss_reduced_set_force(s, force);
+            ok = ok && tss_reduced_step(s, NULL) == TSS_OK;
+            if (!ok || k % 2 == 0) continue;  // every other one
+            memcpy(x + (size_t)count * n, tss_reduced_x(s), n * sizeof *x);
+            memcpy(z + (size_t)count++ * r, tss_reduced_z(s), r * sizeof *z);
+        }
+        neural_script_free(&script);
+    }
+    tss_reduced_destroy(s), free(target), free(force);
+    return ok ? count : fail(v->r, "%s: whiten: the solver cannot step", v->r->o.scene);
+}
+
+// v->T and v->S from a base, if they are asked for and not there. whiten_at solver: after the whitening by
+// frames, in whose coordinates the base is solved for, another by the states that this ends in.
+static int neural_whitening(neural *v, tss_model *base) {
+    int r = v->d->r, count = NEURAL_WHITEN_STATES, ok = 1;
+    size_t rr = (size_t)(r * r);
+    if (!v->d->lipschitz.whiten || v->T) return 1;
+    double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, base, NEURAL_BASE, x, count);
+    double *A = (double *)need(4 * rr, sizeof *A), *T = A + rr, *S = T + rr, *swap = S + rr, began = now(NULL);
+    double *T0 = (double *)need(rr, sizeof *T0), *S0 = (double *)need(rr, sizeof *S0);
+    ok = neural_mean_hessian(v, base, 0, count, x, z, A);
+    if (ok) neural_roots(r, A, T0, S0);
+    if (ok && v->d->lipschitz.whiten_at) {
+        ok = tss_model_change_z(base, T0) == TSS_OK && (count = neural_solved(v, base, x, z)) > 0 && neural_mean_hessian(v, base, 1, count, x, z, A);
+        if (ok) {
+            neural_roots(r, A, T, S);
+            neural_times(r, T0, T, swap), memcpy(T0, swap, rr * sizeof *T0);
+            neural_times(r, S, S0, swap), memcpy(S0, swap, rr * sizeof *S0);
+            printf("whitening: %d states of the solver, %.1f s\n", count, now(NULL) - began);
+        }
+    }
+    if (ok) v->T = T0, v->S = S0;
+    else free(T0), free(S0);
     free(x), free(z), free(A);
-    return 1;
+    return ok;
 }
 
 // The whitening, from base_N.tssn.
@@ -1442,14 +1543,7 @@ static int neural_entry_open(neural_trial *t, int which) {
     neural_selection chosen;
     if (which == NEURAL_TRIAL_LIPSCHITZ && d->unsupervised && !neural_whitening_read(v)) return 0;
     if (!neural_cubature(v, &e->m, which == NEURAL_TRIAL_LIPSCHITZ ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, d->solver.cubature, &e->cells, &chosen)) return 0;
-    tss_reduced_def rd = tss_reduced_def_default();
-    rd.decoder = e->m.decoder, rd.elements = e->cells ? e->cells : v->elements, rd.mass = v->mass, rd.h = v->h;
-    if (v->ball.radius > 0) {
-        rd.sdf = tss_sdf_ball, rd.sdf_user = &v->ball, rd.contact_stiffness = v->ball_stiffness;
-        rd.contact_margin = v->ball_margin, rd.contact_weight = v->area;
-    }
-    rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
-    rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+    tss_reduced_def rd = neural_solver(v, e->m.decoder, e->cells);
     tss_host host = tss_host_default();
     host.log = print_log, host.workers = v->r->o.threads;
     e->used = 1;

@@ -56,6 +56,13 @@ near() { awk -v a="$1" -v b="$2" -v d="$3" 'BEGIN {exit !(a > 0 && a < (1 + d) *
 claim "neural: networks begin as the linear subspace" 'tss train "$out/l" $still >"$build/neural_l.log" 2>&1 && tss evaluate "$out/l" $still --no-full >>"$build/neural_l.log" 2>&1 &&
     near "$(of vanilla projection_error)" "$(of linear projection_error)" 1e-4 && near "$(of vanilla simulation_error)" "$(of linear simulation_error)" 1e-3 &&
     near "$(of vanilla energy)" "$(of linear energy)" 1e-4'
+# Other coordinates, by the Hessians where the solver ends: the same states in fewer evaluations.
+of2() { awk -F, -v m="$1" -v c="$2" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == m {print $k}' "$out/m/evaluate.csv"; }
+# shellcheck disable=SC2086
+claim "neural: whitened where the solver ends" 'solver="$still --set neural.lipschitz.whiten=true --set neural.lipschitz.whiten_at=solver"
+    tss train "$out/m" $solver >"$build/neural_m.log" 2>&1 && tss evaluate "$out/m" $solver --no-full >>"$build/neural_m.log" 2>&1 &&
+    grep -q "^whitening: 18 states of the solver" "$build/neural_m.log" && less "$(of2 lipschitz evaluations)" "$(of2 vanilla evaluations)" &&
+    near "$(of2 lipschitz simulation_error)" "$(of2 vanilla simulation_error)" 1e-3 && near "$(of2 lipschitz projection_error)" "$(of2 vanilla projection_error)" 1e-4'
 claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
     "$build/tss" neural evaluate examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
