@@ -69,6 +69,7 @@ typedef struct neural {
     // D: the decoder's last map, B diag(unit). unit: 1, or with pca.scale the root mean square of c's.
     int p;
     double *B, *A, *D, *unit, *code, *code_test;
+    double prepared; // s of this run for the whitening and the cubature: of the Lipschitz phase's time
     double *T, *S;   // lipschitz.whiten: z = T y, y = S z; r × r
     double *before;  // n: full space one step ago, for a first guess of the next
     double left;    // largest distance of a node in what B misses, over size
@@ -1142,9 +1143,10 @@ static int neural_whitening(neural *v, tss_model *base) {
             neural_roots(r, A, T, S);
             neural_times(r, T0, T, swap), memcpy(T0, swap, rr * sizeof *T0);
             neural_times(r, S, S0, swap), memcpy(S0, swap, rr * sizeof *S0);
-            printf("whitening: %d states of the solver, %.1f s\n", count, now(NULL) - began);
         }
     }
+    if (ok) printf("whitening: %d states%s, %.1f s\n", count, v->d->lipschitz.whiten_at ? " of the solver" : "", now(NULL) - began);
+    v->prepared += now(NULL) - began;
     if (ok) v->T = T0, v->S = S0;
     else free(T0), free(S0);
     free(x), free(z), free(A);
@@ -1375,7 +1377,7 @@ static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t)
     }
     size_t all = neural_parameters(t->m.decoder) + neural_parameters(t->m.encoder);
     if (!t->m.adam && tss_adam_create(NULL, &a, all, &t->m.adam) != TSS_OK) return fail(v->r, "out of memory");
-    t->seconds = neural_spent(v, phase, t->m.step);
+    t->seconds = neural_spent(v, phase, t->m.step) + (phase == NEURAL_LIPSCHITZ && t->m.step == t->first ? v->prepared : 0);
     t->z_test = neural_spread(v, v->test, v->tests, NEURAL_SAMPLES);
     return (v->d->unsupervised ? neural_trainer_unsupervised(t) : neural_trainer_supervised(t)) && neural_rows_open(t);
 }
@@ -1462,6 +1464,7 @@ static int neural_train(neural *v) {
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
     int ok = neural_cubature(v, &base, NEURAL_BASE, v->d->lipschitz.cubature, &v->cubature, &chosen);
     tss_model_free(&base);
+    v->prepared = chosen.seconds;
     if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
     if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
     return ok;
