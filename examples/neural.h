@@ -396,6 +396,8 @@ static int neural_open(run *r, neural *v) {
                     v->d->lipschitz.probes, v->d->r);
     if (v->d->train.start && v->d->unsupervised)
         return fail(r, "%s: neural.train.start is \"linear\", expected \"random\" where nothing is supervised", r->o.scene);
+    if (v->d->lipschitz.whiten_end && v->d->unsupervised)
+        return fail(r, "%s: neural.lipschitz.whiten_end is true, expected false where nothing is supervised", r->o.scene);
     for (int k = 0; v->d->train.start && k < v->d->layers; k++)
         if (v->d->hidden[k] < v->d->r)
             return fail(r, "%s: neural.hidden[%d] is %d, expected at least neural.r (%d) with train.start \"linear\"", r->o.scene, k,
@@ -1041,33 +1043,49 @@ static tss_result neural_tangent_stiffness(neural *v, const tss_model *m, const 
     return e;
 }
 
+// A ← A⁻¹, symmetric and positive, by eigenvalues; W: 2 r².
+static void neural_inverse(int r, double *A, double *W) {
+    double *E = W + r * r;
+    memcpy(W, A, (size_t)(r * r) * sizeof *W), memset(A, 0, (size_t)(r * r) * sizeof *A);
+    neural_jacobi(r, W, E);
+    for (int q = 0; q < r; q++)
+        for (int i = 0; i < r * r; i++) A[i] += E[q * r + i / r] * E[q * r + i % r] / fmax(W[q * (r + 1)], 1e-300);
+}
+
 // The mean over states z (count × r), r × r, symmetric. tangent: without the curvature of f, which at a
-// solution counts for little: there forces and inertia nearly balance.
-static int neural_mean_hessian(neural *v, const tss_model *m, int tangent, int count, const double *x, const double *z, double *mean) {
+// solution counts for little: there forces and inertia nearly balance. harmonic: of the inverses, inverted,
+// which the softest states decide and not the stiffest (NULL: not wanted).
+static int neural_mean_hessian(neural *v, const tss_model *m, int tangent, double *harmonic, int count, const double *x, const double *z, double *mean) {
     int r = v->d->r, rr = r * r;
     size_t n = (size_t)v->n;
     double *H = (double *)need((size_t)(2 * rr + 2 * r), sizeof *H), *E = H + rr, *g = E + rr, *P = g + r;
     double *J = (double *)need((size_t)r * n, sizeof *J), *value = (double *)need((size_t)v->pinned, sizeof *value);
-    double *I = (double *)need((size_t)rr, sizeof *I), *room = (double *)need(2 * n, sizeof *room);
+    double *I = (double *)need((size_t)rr, sizeof *I), *room = (double *)need(2 * n, sizeof *room), *one = (double *)need((size_t)rr, sizeof *one);
     tss_held held = {v->pinned, v->pin, value};
     tss_result e = TSS_OK;
     memset(mean, 0, (size_t)rr * sizeof *mean);
+    if (harmonic) memset(harmonic, 0, (size_t)rr * sizeof *harmonic);
     for (int i = 0; i < r; i++) I[i * (r + 1)] = 1;
     for (int k = 0; k < count && e == TSS_OK; k++) {
         if (v->pinned) neural_pinned(v, x + (size_t)k * n, 1, value);
         e = tangent ? neural_tangent_stiffness(v, m, z + k * r, value, I, J, room, H)
                     : tss_reduced_potential_held(m->decoder, v->elements, v->work, v->pinned ? &held : NULL, 1, z + k * r, P, g, H);
         neural_jacobi(r, H, E);
+        memset(one, 0, (size_t)rr * sizeof *one);
         for (int i = 0; i < r * rr; i++) {
             int q = i / rr, a = i % rr;
-            mean[a] += fabs(H[q * (r + 1)]) * E[q * r + a / r] * E[q * r + a % r] / count;
+            one[a] += fabs(H[q * (r + 1)]) * E[q * r + a / r] * E[q * r + a % r];
         }
         if (e == TSS_OK && v->h > 0) e = tss_net_jets(m->decoder, v->work, 1, r, z + k * r, I, NULL, NULL, J, NULL);
         for (int a = 0; a < rr && v->h > 0; a++)
             for (size_t j = 0; j < n; j++)
-                mean[a] += v->mass[j] * J[(size_t)(a / r) * n + j] * J[(size_t)(a % r) * n + j] / (v->h * v->h * count);
+                one[a] += v->mass[j] * J[(size_t)(a / r) * n + j] * J[(size_t)(a % r) * n + j] / (v->h * v->h);
+        for (int a = 0; a < rr; a++) mean[a] += one[a] / count;
+        if (harmonic) neural_inverse(r, one, H);
+        for (int a = 0; harmonic && a < rr; a++) harmonic[a] += one[a] / count;
     }
-    free(H), free(J), free(value), free(I), free(room);
+    if (harmonic) neural_inverse(r, harmonic, H);
+    free(H), free(J), free(value), free(I), free(room), free(one);
     return e == TSS_OK ? 1 : fail(v->r, "%s: whiten: %s", v->r->o.scene, tss_result_text(e));
 }
 
@@ -1135,10 +1153,10 @@ static int neural_whitening(neural *v, tss_model *base) {
     double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, base, NEURAL_BASE, x, count);
     double *A = (double *)need(4 * rr, sizeof *A), *T = A + rr, *S = T + rr, *swap = S + rr, began = now(NULL);
     double *T0 = (double *)need(rr, sizeof *T0), *S0 = (double *)need(rr, sizeof *S0);
-    ok = neural_mean_hessian(v, base, 0, count, x, z, A);
+    ok = neural_mean_hessian(v, base, 0, NULL, count, x, z, A);
     if (ok) neural_roots(r, A, T0, S0);
     if (ok && v->d->lipschitz.whiten_at) {
-        ok = tss_model_change_z(base, T0) == TSS_OK && (count = neural_solved(v, base, x, z)) > 0 && neural_mean_hessian(v, base, 1, count, x, z, A);
+        ok = tss_model_change_z(base, T0) == TSS_OK && (count = neural_solved(v, base, x, z)) > 0 && neural_mean_hessian(v, base, 1, NULL, count, x, z, A);
         if (ok) {
             neural_roots(r, A, T, S);
             neural_times(r, T0, T, swap), memcpy(T0, swap, rr * sizeof *T0);
@@ -1442,9 +1460,36 @@ static int neural_train_loop(neural_trainer *t) {
     return t->m.step == begun || neural_checkpoint(t);
 }
 
+// lipschitz.whiten_end: the trained decoder in coordinates in which the harmonic mean of its own Hessians is a
+// multiple of 1, and the largest eigenvalue of their mean is 1: a first step of −∇E is not too long.
+static int neural_whiten_end(neural_trainer *t) {
+    neural *v = t->v;
+    int r = v->d->r, count = NEURAL_WHITEN_STATES;
+    size_t rr = (size_t)(r * r);
+    double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, &t->m, NEURAL_VANILLA, x, count);
+    double *A = (double *)need(5 * rr, sizeof *A), *T = A + rr, *S = T + rr, *mean = S + rr, *E = mean + rr, most = 0, began = now(NULL);
+    tss_adam_def adam = neural_adam(t);
+    int ok = neural_mean_hessian(v, &t->m, 1, A, count, x, z, mean);
+    if (ok) {
+        neural_roots(r, A, T, S);
+        neural_times(r, mean, T, E), neural_times(r, T, E, mean), neural_jacobi(r, mean, E);
+        for (int q = 0; q < r; q++) most = fmax(most, mean[q * (r + 1)]);
+        for (size_t i = 0; i < rr; i++) T[i] /= sqrt(most);
+    }
+    ok = ok && (tss_model_change_z(&t->m, T) == TSS_OK || fail(v->r, "%s: neural.lipschitz.whiten_end: the mean Hessian is singular", v->r->o.scene));
+    if (ok && tss_adam_set(t->m.adam, &adam, 1) != TSS_OK) ok = fail(v->r, "%s: neural.lipschitz: bad rates", v->r->o.scene);
+    free(x), free(z), free(A);
+    if (ok) neural_sync(t), t->seconds += now(NULL) - began;
+    if (ok) printf("whitened at the end: %d states, %.1f s\n", count, now(NULL) - began);
+    return ok && neural_checkpoint(t);
+}
+
 static int neural_train_phase(neural *v, neural_phase phase) {
     neural_trainer t;
-    int ok = neural_trainer_open(v, phase, &t) && neural_train_loop(&t);
+    int ok = neural_trainer_open(v, phase, &t);
+    uint64_t begun = t.m.step;
+    ok = ok && neural_train_loop(&t);
+    if (ok && phase == NEURAL_LIPSCHITZ && v->d->lipschitz.whiten_end && t.m.step == t.last && t.m.step > begun) ok = neural_whiten_end(&t);
     if (ok && t.loss > 0)
         printf("%s: step %llu, %.1f s, loss %.6g (test frames: %.6g), Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds,
                t.loss, t.loss_test, t.lip);

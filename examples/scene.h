@@ -132,7 +132,8 @@
                            handles where the frames have them, supervised (true), window: L_LS of
                            groups of frames this near under one's handles (0: off), whiten: in
                            coordinates in which the mean Hessian of the base is 1 (false), whiten_at: frames |
-                           solver: at the states of this mean (frames), cubature: cells,
+                           solver: at the states of this mean (frames), whiten_end: once more, by the
+                           harmonic mean of the trained decoder's, supervised (false), cubature: cells,
                            0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
                            (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0)}
@@ -269,7 +270,7 @@ typedef struct scene_neural {
         double rate, rate_end, lambda, sigma, eps;
     } train;
     struct {
-        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples, whiten, whiten_at;
+        int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples, whiten, whiten_at, whiten_end;
         double rate, rate_end, weight;
     } lipschitz;
     struct {
@@ -1878,6 +1879,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.handles, "handles"),
     SCENE__INT(scene_neural, lipschitz.window, "window", 0, 1e6),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten, "whiten"),
+    SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten_end, "whiten_end"),
     SCENE__ONE(scene_neural, lipschitz.whiten_at, "whiten_at", scene__whiten_states),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),

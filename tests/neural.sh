@@ -63,6 +63,11 @@ claim "neural: whitened where the solver ends" 'solver="$still --set neural.lips
     tss train "$out/m" $solver >"$build/neural_m.log" 2>&1 && tss evaluate "$out/m" $solver --no-full >>"$build/neural_m.log" 2>&1 &&
     grep -q "^whitening: 18 states of the solver" "$build/neural_m.log" && less "$(of2 lipschitz evaluations)" "$(of2 vanilla evaluations)" &&
     near "$(of2 lipschitz simulation_error)" "$(of2 vanilla simulation_error)" 1e-3 && near "$(of2 lipschitz projection_error)" "$(of2 vanilla projection_error)" 1e-4'
+# shellcheck disable=SC2086
+claim "neural: whitened at the end" 'solver="$still --set neural.lipschitz.whiten=true --set neural.lipschitz.whiten_end=true"; rm "$out/m/evaluate.csv" "$out/m/lipschitz_0.tssn"
+    tss train "$out/m" $solver >"$build/neural_m.log" 2>&1 && tss evaluate "$out/m" $solver --no-full >>"$build/neural_m.log" 2>&1 &&
+    grep -q "^whitened at the end: 200 states" "$build/neural_m.log" && less "$(of2 lipschitz evaluations)" "$(of2 vanilla evaluations)" &&
+    near "$(of2 lipschitz simulation_error)" "$(of2 vanilla simulation_error)" 1e-3 && near "$(of2 lipschitz projection_error)" "$(of2 vanilla projection_error)" 1e-4'
 claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
     "$build/tss" neural evaluate examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
