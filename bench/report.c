@@ -734,8 +734,9 @@ static void neural_distributions(source *s, report *r) {
     for (int i = 0; i < t.rows; i++)
         for (int k = 0; neural_new_system(&t, i) && k < 4; k++) {
             neural_line line[3];
-            for (int m = 0; m < 3; m++) line[m].name = line[m].word = method[m], line[m].column = E_SIMULATION + k, line[m].filter = METHOD;
-            neural_plot(r, &t, curves_cell(&t, i, SYSTEM), title[k], PERCENT, "% of states", "over the diagonal", line, 3);
+            int lines = neural_partner(&t, i, -1, "linear") < 0 ? 2 : 3;  // unsupervised: no such subspace
+            for (int m = 0; m < lines; m++) line[m].name = line[m].word = method[m], line[m].column = E_SIMULATION + k, line[m].filter = METHOD;
+            neural_plot(r, &t, curves_cell(&t, i, SYSTEM), title[k], PERCENT, "% of states", "over the diagonal", line, lines);
         }
     report_columns_end(r);
     curves_table_free(&t);
