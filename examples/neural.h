@@ -1435,6 +1435,12 @@ static int neural_checkpoint(neural_trainer *t) {
     return r == TSS_OK ? 1 : fail(v->r, "%s: cannot be written: %s", path, tss_result_text(r));
 }
 
+// The phase is over but for the whitening at its end, which has no checkpoint before it: one that is killed
+// in it takes its last steps again.
+static int neural_unwhitened(const neural_trainer *t) {
+    return t->phase == NEURAL_LIPSCHITZ && t->v->d->lipschitz.whiten_end && t->m.step == t->last;
+}
+
 static int neural_train_loop(neural_trainer *t) {
     neural *v = t->v;
     tss_training_info i;
@@ -1448,7 +1454,7 @@ static int neural_train_loop(neural_trainer *t) {
         t->rate = i.rate, t->skipped += i.skipped;
         double spent = now(NULL) - start;
         t->seconds = before + spent;
-        if ((t->m.step - t->first) % every == 0 || now(NULL) > saved + 60) {
+        if (((t->m.step - t->first) % every == 0 || now(NULL) > saved + 60) && !neural_unwhitened(t)) {
             if (!neural_checkpoint(t)) return 0;
             saved = now(NULL);
         }
@@ -1457,7 +1463,7 @@ static int neural_train_loop(neural_trainer *t) {
                         (unsigned long long)(t->m.step - t->first), (unsigned long long)(t->last - t->first), t->loss,
                         t->lipschitz, t->lip, spent / (double)(t->m.step - begun) * (double)(t->last - t->m.step));
     }
-    return t->m.step == begun || neural_checkpoint(t);
+    return t->m.step == begun || neural_unwhitened(t) || neural_checkpoint(t);
 }
 
 // lipschitz.whiten_end: the trained decoder in coordinates in which the harmonic mean of its own Hessians is a
@@ -1489,10 +1495,10 @@ static int neural_train_phase(neural *v, neural_phase phase) {
     int ok = neural_trainer_open(v, phase, &t);
     uint64_t begun = t.m.step;
     ok = ok && neural_train_loop(&t);
-    if (ok && phase == NEURAL_LIPSCHITZ && v->d->lipschitz.whiten_end && t.m.step == t.last && t.m.step > begun) ok = neural_whiten_end(&t);
+    if (ok && neural_unwhitened(&t) && t.m.step > begun) ok = neural_whiten_end(&t);
     if (ok && t.loss > 0)
-        printf("%s: step %llu, %.1f s, loss %.6g (test frames: %.6g), Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds,
-               t.loss, t.loss_test, t.lip);
+        printf("%s: step %llu, %.1f s, loss %.6g, Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds, t.loss, t.lip);
+    if (ok && t.loss > 0 && t.m.encoder) printf("%s: loss of the test frames %.6g\n", neural_phases[phase], t.loss_test);
     fflush(stdout);
     neural_trainer_close(&t);
     return ok;
