@@ -1021,7 +1021,7 @@ static tss_reduced_def neural_solver(neural *v, const tss_net *decoder, const ts
 #define NEURAL_SOLVED_STEPS 6
 #define NEURAL_WHITEN_LEAST 1e-6  // of the largest eigenvalue: directions that move nothing stay finite
 
-// JᵀKJ of the elements at f(z), handles at value; J: r × n, room: 2 n.
+// JᵀKJ of the elements at f(z), handles at value, and J (r × n, 0 at handles); room: 2 n.
 static tss_result neural_tangent_stiffness(neural *v, const tss_model *m, const double *z, const double *value, const double *I, double *J,
                                            double *room, double *H) {
     int r = v->d->r;
@@ -1076,7 +1076,7 @@ static int neural_mean_hessian(neural *v, const tss_model *m, int tangent, doubl
             int q = i / rr, a = i % rr;
             one[a] += fabs(H[q * (r + 1)]) * E[q * r + a / r] * E[q * r + a % r];
         }
-        if (e == TSS_OK && v->h > 0) e = tss_net_jets(m->decoder, v->work, 1, r, z + k * r, I, NULL, NULL, J, NULL);
+        if (e == TSS_OK && v->h > 0 && !tangent) e = tss_net_jets(m->decoder, v->work, 1, r, z + k * r, I, NULL, NULL, J, NULL);
         for (int a = 0; a < rr && v->h > 0; a++)
             for (size_t j = 0; j < n; j++)
                 one[a] += v->mass[j] * J[(size_t)(a / r) * n + j] * J[(size_t)(a % r) * n + j] / (v->h * v->h);
@@ -1156,7 +1156,8 @@ static int neural_whitening(neural *v, tss_model *base) {
     ok = neural_mean_hessian(v, base, 0, NULL, count, x, z, A);
     if (ok) neural_roots(r, A, T0, S0);
     if (ok && v->d->lipschitz.whiten_at) {
-        ok = tss_model_change_z(base, T0) == TSS_OK && (count = neural_solved(v, base, x, z)) > 0 && neural_mean_hessian(v, base, 1, NULL, count, x, z, A);
+        ok = tss_model_change_z(base, T0) == TSS_OK || fail(v->r, "%s: neural.lipschitz.whiten: the mean Hessian is singular", v->r->o.scene);
+        ok = ok && (count = neural_solved(v, base, x, z)) > 0 && neural_mean_hessian(v, base, 1, NULL, count, x, z, A);
         if (ok) {
             neural_roots(r, A, T, S);
             neural_times(r, T0, T, swap), memcpy(T0, swap, rr * sizeof *T0);

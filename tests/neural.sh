@@ -51,6 +51,7 @@ claim "neural: modes in units of their own" 'tss train "$out/scaled" --set neura
 still="--set neural.train.start=linear --set neural.pca.scale=true --set neural.train.steps=1 --set neural.train.rate=1e-12 --set neural.train.rate_end=1e-12
     --set neural.lipschitz.steps=1 --set neural.lipschitz.rate=1e-12 --set neural.lipschitz.rate_end=1e-12 --set neural.solver.ftol=0 --set neural.solver.eps=1e-7"
 of() { awk -F, -v m="$1" -v c="$2" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == m {print $k}' "$out/l/evaluate.csv"; }
+# near A B D: within a share D of each other; 1e-3 for sums over steps that each end at a gradient of 1e-7
 near() { awk -v a="$1" -v b="$2" -v d="$3" 'BEGIN {exit !(a > 0 && a < (1 + d) * b && b < (1 + d) * a)}'; }
 # shellcheck disable=SC2086
 claim "neural: networks begin as the linear subspace" 'tss train "$out/l" $still >"$build/neural_l.log" 2>&1 && tss evaluate "$out/l" $still --no-full >>"$build/neural_l.log" 2>&1 &&
