@@ -2401,11 +2401,11 @@ static void tss__jacobi_dense(int n, int p, int q, double *A, double *Q) {
     A[p * n + q] = A[q * n + p] = 0;
 }
 
-// Nearest PSD matrix to symmetric A, n <= 12, by cyclic Jacobi.
-static void tss__clamp_dense(int n, double *A) {
-    double Q[144], T[144], all = 0;
-    for (int i = 0; i < n * n; i++) Q[i] = i % (n + 1) ? 0 : 1, T[i] = A[i], all += A[i] * A[i];
-    // what is within the rounding of A is left where it is
+// Symmetric T to QᵀTQ, diagonal to rounding, by cyclic Jacobi; Q: the eigenvectors, by columns.
+static void tss__eigen_dense(int n, double *T, double *Q) {
+    double all = 0;
+    for (int i = 0; i < n * n; i++) Q[i] = i % (n + 1) ? 0 : 1, all += T[i] * T[i];
+    // what is within the rounding of T is left where it is
     for (int sweep = 0, turns = 1; sweep < 12 && turns > 0; sweep++) {
         turns = 0;
         for (int p = 0; p < n; p++)
@@ -2415,18 +2415,17 @@ static void tss__clamp_dense(int n, double *A) {
                     turns++;
                 }
     }
+}
+
+// A ← A − λ q qᵀ
+static void tss__take_eigenvector(int n, double lambda, const double *q, double *A) {
     for (int i = 0; i < n; i++)
-        for (int j = 0; j <= i; j++) {
-            double s = 0;
-            for (int k = 0; k < n; k++)
-                if (T[k * n + k] > 0) s += T[k * n + k] * Q[i * n + k] * Q[j * n + k];
-            A[i * n + j] = A[j * n + i] = s;
-        }
+        for (int j = 0; j <= i; j++) A[j * n + i] = A[i * n + j] -= lambda * q[i] * q[j];
 }
 
 // out_abcd = Σ_m R_ma in_mbcd, ... for each index of a 3 × 3 × 3 × 3 tensor in turn: R of indices 0
-// and 2 is U, of 1 and 3 is V; back: their transposes.
-static void tss__turn_tensor(const double *U, const double *V, int back, double *C) {
+// and 2 is U, of 1 and 3 is V.
+static void tss__turn_tensor(const double *U, const double *V, double *C) {
     double T[81];
     for (int axis = 0; axis < 4; axis++) {
         const double *R = axis & 1 ? V : U;
@@ -2434,7 +2433,7 @@ static void tss__turn_tensor(const double *U, const double *V, int back, double 
         for (int j = 0; j < 27; j++)
             for (int a = 0; a < 3; a++) {
                 double s = 0;
-                for (int m = 0; m < 3; m++) s += R[back ? 3 * a + m : 3 * m + a] * C[27 * m + j];
+                for (int m = 0; m < 3; m++) s += R[3 * m + a] * C[27 * m + j];
                 T[3 * j + a] = s;
             }
         memcpy(C, T, sizeof T);
@@ -2482,17 +2481,35 @@ static void tss__principal_axes(const double *F, double *U, double *V) {
     }
 }
 
-// C to the nearest PSD matrix. Orthogonal changes of basis alter nothing of that, and between F's
-// principal axes an isotropic density has but one 3 × 3 and three 2 × 2 blocks: Jacobi then has next
-// to nothing left to do (5 times faster in all). Any other density is as right, for a little more.
+// C to the nearest PSD matrix: without its negative eigenvalues. Orthogonal changes of basis alter
+// nothing of that, and between F's principal axes an isotropic density has but one 3 × 3 and three
+// 2 × 2 blocks: Jacobi then has next to nothing left to do. Any other density is as right, for a
+// little more. What has no negative eigenvalue stays as it is, to the bit.
 static void tss__custom_clamp(int d, const double *F, double *C) {
-    double U[9], V[9];
+    const int n = d * d;
+    double U[9], V[9], T[81], Q[81];
+    memcpy(T, C, (size_t)(n * n) * sizeof *T);
     if (d == 3) {
         tss__principal_axes(F, U, V);
-        tss__turn_tensor(U, V, 0, C);
+        tss__turn_tensor(U, V, T);
     }
-    tss__clamp_dense(d * d, C);
-    if (d == 3) tss__turn_tensor(U, V, 1, C);
+    tss__eigen_dense(n, T, Q);
+    for (int k = 0; k < n; k++) {
+        double q[9], UQ[9];
+        if (!(T[k * n + k] < 0)) continue;
+        for (int i = 0; i < n; i++) q[i] = Q[i * n + k];
+        if (d == 3) {  // back from the axes: U q Vᵀ
+            for (int i = 0; i < 9; i++) {
+                const double *u = U + i - i % 3, *c = q + i % 3;
+                UQ[i] = u[0] * c[0] + u[1] * c[3] + u[2] * c[6];
+            }
+            for (int i = 0; i < 9; i++) {
+                const double *u = UQ + i - i % 3, *v = V + i % 3 * 3;
+                q[i] = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
+            }
+        }
+        tss__take_eigenvector(n, T[k * n + k], q, C);
+    }
 }
 
 // H = vol Gᵀ C G, G the constant map from node positions to F: C G first.
