@@ -36,7 +36,7 @@ deps:
 
 #: demo          run the main scene: out/demo/report.html, stats.csv, frames/*.png
 demo: $(BUILD)/tss
-	$(BUILD)/tss run examples/scenes/demo.json -o $(OUT)/demo --frames png
+	OMP_WAIT_POLICY=$${OMP_WAIT_POLICY:-passive} $(BUILD)/tss run examples/scenes/demo.json -o $(OUT)/demo --frames png
 	@echo "open $(OUT)/demo/report.html"
 
 #: report        error against run time, stability, leaving out: out/report/*.html (under 30 minutes)

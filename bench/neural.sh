@@ -1,10 +1,11 @@
 #!/bin/sh
 # Neural subspaces (docs/neural.md): bench/neural.sh [-b BUILD] [-w WORK] [-m MINUTES] [-s SYSTEM]...
-#                                                    [-n SEED]... [-r REPEAT] [-t STEPS] [OUT] [PART...]
+#                                                    [-n SEED]... [-r REPEAT] [-t STEPS] [-c CELLS]... [-F] [OUT] [PART...]
 # Trains the scenes examples/scenes/neural_SYSTEM.json in WORK (build/neural_bench) and adds rows to
 # OUT (bench/results). A part whose rows are in its CSV already is not run again, and training goes on
-# where it stopped: call it until it ends with 0 (3: MINUTES are over; 1: something failed). -t: of each
-# test sequence only the first STEPS (for the large systems, whose steps take seconds).
+# where it stopped: call it until it ends with 0 (3: MINUTES are over; 1: something failed). For the large
+# systems, whose steps take seconds: -t: of each test sequence only the first STEPS; -F: full space is what
+# the frames have, not timed once more; -c: CELLS of part runtime (0, all, and those of the scene's training).
 #   part     file                  system (unless -s)    paper B
 #   methods  neural.csv            all small; also -s twist_bar, cloth, dinosaur, elephant, bunny   Table 1: vanilla, lipschitz, linear, full
 #            neural_errors.csv     as neural.csv         deciles of the errors (also by the part errors, from trained models)
@@ -19,7 +20,7 @@
 # The weight of an order o is λ (Lip_2 / Lip_o)² with the scene's λ for order 2 and vanilla's Eq. 7:
 # then λ Lip² is the same for all.
 set -u
-build=build work= minutes=600 systems= seeds= repeat=3 steps=
+build=build work= minutes=600 systems= seeds= repeat=3 steps= cells= full=
 while [ $# -gt 0 ]; do
     case $1 in
     -b) build=$2; shift 2 ;;
@@ -29,6 +30,8 @@ while [ $# -gt 0 ]; do
     -n) seeds="$seeds $2"; shift 2 ;;
     -r) repeat=$2; shift 2 ;;
     -t) steps=$2; shift 2 ;;
+    -c) cells="$cells $2"; shift 2 ;;
+    -F) full=--no-full; shift ;;
     *) break ;;
     esac
 done
@@ -110,7 +113,7 @@ rows() {
     action=$1 file=$2 system=$3 dir=$4 seed=$5; shift 5
     left >/dev/null || exit 3
     csv=$dir/$action.csv; rm -f "$csv" "$dir/errors.csv"
-    again="--repeat $repeat ${steps:+--steps $steps}"; [ "$action" != measure ] || again=
+    again="--repeat $repeat ${steps:+--steps $steps} $full"; [ "$action" != measure ] || again=
     # shellcheck disable=SC2086
     tss "$action" "$system" "$dir" "$seed" $again "$@" && add "$csv" "$file" && echo "$system, seed $seed: $file $*"
 }
@@ -125,7 +128,7 @@ errors() {
     train "$1" "$2" || return
     rm -f "$work/$1/errors.csv"
     # shellcheck disable=SC2086
-    tss evaluate "$1" "$work/$1" "$2" --no-full ${steps:+--steps $steps} && add "$work/$1/errors.csv" neural_errors.csv && echo "$1, seed $2: neural_errors.csv"
+    tss evaluate "$1" "$work/$1" "$2" --no-full ${steps:+--steps $steps} ${cells:+--set neural.solver.cubature=${cells# }} && add "$work/$1/errors.csv" neural_errors.csv && echo "$1, seed $2: neural_errors.csv"
 }
 
 newton() {
@@ -163,8 +166,8 @@ order() {
 }
 
 runtime() {
-    cells=$(awk 'match($0, /"cubature": [0-9]+/) {print substr($0, RSTART + 12, RLENGTH - 12)}' "examples/scenes/neural_$1.json")
-    for c in 0 "$cells"; do
+    scenes=$(awk 'match($0, /"cubature": [0-9]+/) {print substr($0, RSTART + 12, RLENGTH - 12)}' "examples/scenes/neural_$1.json")
+    for c in ${cells:-0 "$scenes"}; do
         train "$1" "$2" || return
         [ "$c" = 0 ] && there neural_runtime.csv system="$1" seed="$2" && continue
         there neural_runtime.csv system="$1" seed="$2" runtime_cells="$c" && continue

@@ -1,5 +1,5 @@
 /* 01_hello: a soft cube falls on the ground. Needs no package:
-   cc -O2 -DTSS_NO_LAPACK -DTSS_NO_METIS -I. examples/01_hello.c -o hello -lm
+   cc -O2 -DTSS_NO_METIS -I. examples/01_hello.c -o hello -lm
    Prints the height at which its middle comes to rest; it is known by "middle at 0.244 m". */
 #define TSS_IMPLEMENTATION
 #include "tss.h"
@@ -43,7 +43,7 @@ int main(void) {
     cd.planes = 1, cd.plane = &ground;
     if (tss_world_create(&wd, &w) != TSS_OK || tss_body_add(w, &bd, NULL) != TSS_OK ||
         tss_ipc_add(w, &cd, NULL) != TSS_OK || tss_world_prepare(w) != TSS_OK)
-        return printf("%s\n", w ? tss_world_error(w) : "no memory"), 1;
+        return printf("%s\n", w ? tss_world_error(w) : "no world: a bad tss_world_def, or no memory"), 1;
     for (int step = 0; step < 200; step++) {
         tss_step_info info;
         if (tss_world_step(w, &info) != TSS_OK) return printf("%s\n", tss_world_error(w)), 1;

@@ -900,6 +900,19 @@ static void neural_path(const neural *v, neural_phase phase, char path[700]) {
 }
 
 // A model of this scene; *there = 0: no file.
+static int neural_missing(const neural *v, neural_phase phase) {
+    return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s -o %s --seed %d` makes it", v->r->o.out, neural_phases[phase], v->r->o.seed,
+                v->r->o.scene, v->r->o.out, v->r->o.seed);
+}
+
+// Whether the file is there, before anything long is begun. 0: fails.
+static int neural_expect(const neural *v, neural_phase phase) {
+    char path[700];
+    neural_path(v, phase, path);
+    FILE *f = fopen(path, "rb");
+    return f ? fclose(f), 1 : neural_missing(v, phase);
+}
+
 static int neural_read(neural *v, neural_phase phase, tss_model *m, int *there) {
     char path[700], why[300] = "";
     tss_net_info i;
@@ -1017,6 +1030,7 @@ static tss_reduced_def neural_solver(neural *v, const tss_net *decoder, const ts
 // ---------------------------------------------------------------------------------------------
 
 #define NEURAL_WHITEN_STATES 200
+#define NEURAL_WHITEN_FEW 48     // the same with more than NEURAL_MANY cells
 #define NEURAL_SOLVED 8         // training sequences, and steps of each, whose every other state stands for the solver's
 #define NEURAL_SOLVED_STEPS 6
 #define NEURAL_WHITEN_LEAST 1e-6  // of the largest eigenvalue: directions that move nothing stay finite
@@ -1067,6 +1081,7 @@ static int neural_mean_hessian(neural *v, const tss_model *m, int tangent, doubl
     if (harmonic) memset(harmonic, 0, (size_t)rr * sizeof *harmonic);
     for (int i = 0; i < r; i++) I[i * (r + 1)] = 1;
     for (int k = 0; k < count && e == TSS_OK; k++) {
+        neural_progress(v, (k + 1.0) / count, "whitening: Hessian %d of %d", k + 1, count);
         if (v->pinned) neural_pinned(v, x + (size_t)k * n, 1, value);
         e = tangent ? neural_tangent_stiffness(v, m, z + k * r, value, I, J, room, H)
                     : tss_reduced_potential_held(m->decoder, v->elements, v->work, v->pinned ? &held : NULL, 1, z + k * r, P, g, H);
@@ -1144,10 +1159,12 @@ static int neural_solved(neural *v, const tss_model *m, double *x, double *z) {
     return ok ? count : fail(v->r, "%s: whiten: the solver cannot step", v->r->o.scene);
 }
 
+static int neural_whiten_states(const neural *v) { return v->cells > NEURAL_MANY ? NEURAL_WHITEN_FEW : NEURAL_WHITEN_STATES; }
+
 // v->T and v->S from a base, if they are asked for and not there. whiten_at solver: after the whitening by
 // frames, in whose coordinates the base is solved for, another by the states that this ends in.
 static int neural_whitening(neural *v, tss_model *base) {
-    int r = v->d->r, count = NEURAL_WHITEN_STATES, ok = 1;
+    int r = v->d->r, count = neural_whiten_states(v), ok = 1;
     size_t rr = (size_t)(r * r);
     if (!v->d->lipschitz.whiten || v->T) return 1;
     double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, base, NEURAL_BASE, x, count);
@@ -1179,7 +1196,7 @@ static int neural_whitening_read(neural *v) {
     if (!v->d->lipschitz.whiten || v->T) return 1;
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
     if (there) ok = neural_whitening(v, &base), tss_model_free(&base);
-    return ok && (there || fail(v->r, "%s/base_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, v->r->o.seed, v->r->o.scene));
+    return ok && (there || neural_missing(v, NEURAL_BASE));
 }
 
 // ---------------------------------------------------------------------------------------------
@@ -1460,7 +1477,7 @@ static int neural_train_loop(neural_trainer *t) {
             saved = now(NULL);
         }
         neural_progress(v, (double)(t->m.step - t->first) / (double)(t->last - t->first),
-                        "%s %llu of %llu: loss %.4g, L_LS %.4g, Lip %.4g, %.0f s left", neural_phases[t->phase],
+                        "%s (phase %d of 3) %llu of %llu: loss %.4g, L_LS %.4g, Lip %.4g, %.0f s left in it", neural_phases[t->phase], t->phase + 1,
                         (unsigned long long)(t->m.step - t->first), (unsigned long long)(t->last - t->first), t->loss,
                         t->lipschitz, t->lip, spent / (double)(t->m.step - begun) * (double)(t->last - t->m.step));
     }
@@ -1471,7 +1488,7 @@ static int neural_train_loop(neural_trainer *t) {
 // multiple of 1, and the largest eigenvalue of their mean is 1: a first step of −∇E is not too long.
 static int neural_whiten_end(neural_trainer *t) {
     neural *v = t->v;
-    int r = v->d->r, count = NEURAL_WHITEN_STATES;
+    int r = v->d->r, count = neural_whiten_states(v);
     size_t rr = (size_t)(r * r);
     double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, &t->m, NEURAL_VANILLA, x, count);
     double *A = (double *)need(5 * rr, sizeof *A), *T = A + rr, *S = T + rr, *mean = S + rr, *E = mean + rr, most = 0, began = now(NULL);
@@ -1519,6 +1536,9 @@ static int neural_train(neural *v) {
     v->prepared = chosen.seconds;
     if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
     if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
+    if (ok && !v->stopped)
+        printf("trained. What comes of it: `tss neural evaluate %s -o %s --seed %d`; with pictures: `run`\n", v->r->o.scene, v->r->o.out,
+               v->r->o.seed);
     return ok;
 }
 
@@ -1592,9 +1612,7 @@ static int neural_entry_open(neural_trial *t, int which) {
     if (which == NEURAL_TRIAL_LINEAR && d->unsupervised) return 1;
     neural_phase phase = which == NEURAL_TRIAL_VANILLA ? NEURAL_VANILLA : NEURAL_LIPSCHITZ;
     if (which == NEURAL_TRIAL_LINEAR ? !neural_linear(v, &e->m) : !neural_read(v, phase, &e->m, &there)) return 0;
-    if (!there)
-        return fail(v->r, "%s/%s_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, neural_phases[phase],
-                    v->r->o.seed, v->r->o.scene);
+    if (!there) return neural_missing(v, phase);
     neural_selection chosen;
     if (which == NEURAL_TRIAL_LIPSCHITZ && d->unsupervised && !neural_whitening_read(v)) return 0;
     if (!neural_cubature(v, &e->m, which == NEURAL_TRIAL_LIPSCHITZ ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, d->solver.cubature, &e->cells, &chosen)) return 0;
@@ -1611,7 +1629,7 @@ static int neural_trial_open(neural *v, neural_trial *t) {
     double lo[3], hi[3];
     memset(t, 0, sizeof *t);
     t->v = v;
-    if (!neural_frames(v)) return 0;
+    if (!neural_expect(v, NEURAL_VANILLA) || !neural_expect(v, NEURAL_LIPSCHITZ) || !neural_frames(v)) return 0;
     if (v->stopped) return fail(v->r, "%s/frames.bin: not all frames are there yet", v->r->o.out);
     if (v->d->script.validate) {
         neural_start start;
@@ -1788,15 +1806,16 @@ static void neural_table(const neural_trial *t) {
            "converged/saddle/line/it", "gradient", "energy", "error", "farthest", "projection", "Lip");
     for (int k = 0; k < NEURAL_TRIALS; k++) {
         const neural_entry *e = &t->e[k];
-        char exits[60];
+        char exits[60], projection[32], lip[32];
         int n = t->steps;
         if (!e->used) continue;
         snprintf(exits, sizeof exits, "%d/%d/%d/%d", neural_exits(e, n, TSS_EXIT_CONVERGED), neural_exits(e, n, TSS_EXIT_SADDLE),
                  neural_exits(e, n, TSS_EXIT_LINE_SEARCH), neural_exits(e, n, TSS_EXIT_ITERATIONS));
-        printf("%-10s %9.3f %7.1f %7.1f %24s %10.3g %10.5g %10.3g %10.3g %10.3g %9.4g\n", neural_trial_names[k],
+        snprintf(projection, sizeof projection, e->projection_mean > 0 ? "%.3g" : "-", e->projection_mean);
+        snprintf(lip, sizeof lip, e->lip[2] > 0 ? "%.4g" : "-", e->lip[2]);  // by `run` neither is measured
+        printf("%-10s %9.3f %7.1f %7.1f %24s %10.3g %10.5g %10.3g %10.3g %10s %9s\n", neural_trial_names[k],
                1e3 * neural_mean(e->seconds, n), neural_mean_of(e->iterations, n), neural_mean_of(e->evaluations, n), exits,
-               neural_mean(e->gradient, n), neural_mean(e->energy, n), neural_mean(e->mean, n), neural_most(e->farthest, n),
-               e->projection_mean, e->lip[2]);
+               neural_mean(e->gradient, n), neural_mean(e->energy, n), neural_mean(e->mean, n), neural_most(e->farthest, n), projection, lip);
     }
 }
 
@@ -2289,10 +2308,11 @@ static int neural_measure(neural *v) {
     if (v->r->o.threads != 1) return fail(v->r, "tss neural measure: expected --threads 1 (it counts the CPU time of one)");
     if (v->d->lipschitz.order != 2 || !(v->d->lipschitz.weight > 0))
         return fail(v->r, "%s: neural.lipschitz: expected order 2 and a weight above 0 for measure", v->r->o.scene);
+    if (!neural_expect(v, NEURAL_BASE)) return 0;
     if (!neural_frames(v) || v->stopped) return !v->r->why.text[0];
     if (!v->d->unsupervised && !neural_basis(v)) return 0;
     if (!neural_read(v, NEURAL_BASE, &base, &there)) return 0;
-    if (!there) return fail(v->r, "%s/base_%d.tssn: not there; `tss neural train %s` makes it", v->r->o.out, v->r->o.seed, v->r->o.scene);
+    if (!there) return neural_missing(v, NEURAL_BASE);
     int ok = neural_cubature(v, &base, NEURAL_BASE, v->d->lipschitz.cubature, &v->cubature, &s) && neural_cubature_errors(v, &base, error);
     tss_model_free(&base);
     ok = ok && neural_step_costs(v, seconds) && neural_measure_row(v, &s, error, seconds);
@@ -2441,6 +2461,7 @@ static int command_neural(run *r) {
     if (ok) ok = strcmp(r->o.action, "train") == 0 ? neural_train(&v) : strcmp(r->o.action, "run") == 0 ? neural_run(&v)
                   : strcmp(r->o.action, "measure") == 0 ? neural_measure(&v)
                   : strcmp(r->o.action, "bridge") == 0 ? neural_bridge(&v) : neural_evaluate(&v);
+    if (ok && v.stopped) printf("out of --minutes; what was done is kept, and the same command goes on from there\n");
     neural_close(&v);
     return !ok ? 2 : v.stopped ? 3 : 0;
 }

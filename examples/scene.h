@@ -387,6 +387,7 @@ SCENE_API void scene_pose(const scene_motion *m, double clock, const double *fro
 
 #include <cjson/cJSON.h>
 #include <errno.h>
+#include <limits.h>
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -436,18 +437,20 @@ static void scene__warn(scene *s, const char *format, ...) {
 }
 
 static char *scene__file(const char *path, scene_error *e) {
+    errno = 0;
     FILE *f = fopen(path, "rb");
     char *text = NULL;
     long size = -1;
-    if (f && fseek(f, 0, SEEK_END) == 0 && (size = ftell(f)) >= 0 && fseek(f, 0, SEEK_SET) == 0)
+    if (f && fseek(f, 0, SEEK_END) == 0 && (size = ftell(f)) >= 0 && size < LONG_MAX && fseek(f, 0, SEEK_SET) == 0)
         text = (char *)malloc((size_t)size + 1);
     if (text && fread(text, 1, (size_t)size, f) != (size_t)size) {
         free(text);
         text = NULL;
     }
+    int why = size == LONG_MAX ? EISDIR : errno;
     if (text) text[size] = 0;
     if (f) fclose(f);
-    if (!text) scene__fail(e, "%s: cannot be read, expected a scene (JSON or IPC script)", path);
+    if (!text) scene__fail(e, "%s: cannot be read%s%s, expected a scene (JSON or IPC script)", path, why ? ": " : "", why ? strerror(why) : "");
     return text;
 }
 

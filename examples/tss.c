@@ -137,7 +137,22 @@ static int whole(const char *text, int least, int *out) {
 }
 
 static int complain(const char *what, const char *value, const char *expected) {
-    fprintf(stderr, "tss: %s %s: expected %s\n", what, value, expected);
+    fprintf(stderr, "tss: %s%s%s: expected %s\n", what, *value ? " " : "", value, expected);
+    return 0;
+}
+
+static const char *const command_names[] = {"run", "check", "compare", "modes", "neural", NULL};
+static const char *const option_names[] = {
+    "-o",       "--steps",     "--threads", "--budget-ms", "--frames", "--every",  "--resume",
+    "--assets", "--set",       "--check",   "--mode",      "--color",  "--repeat", "--snapshots",
+    "--from",   "--free-steps", "--sweep",  "--nodes",     "--modes",  "--tols",   "--name",
+    "--count",  "--seed",      "--minutes", "--method",    "--no-full", "--help",  "--version", NULL};
+
+static int unknown(const char *what, const char *name, const char *const *names) {
+    char text[200];
+    scene__suggest(name, names, text, sizeof text);
+    int near = strncmp(text, "did", 3) == 0;
+    fprintf(stderr, "tss: no such %s: %s%s%s (`tss --help` lists all)\n", what, name, near ? "; " : "", near ? text : "");
     return 0;
 }
 
@@ -148,8 +163,7 @@ static int add_set(options *o, const char *line) {
 
 // An option that is short for --set key=value; text is where the line stays.
 static int take_key(options *o, const char *key, const char *value, char text[80]) {
-    if (strlen(key) + strlen(value) > 78) return complain(key, value, "a shorter word");
-    snprintf(text, 80, "%s=%s", key, value);
+    if (snprintf(text, 80, "%s=%s", key, value) >= 80) return complain(key, value, "a shorter word");
     return add_set(o, text);
 }
 
@@ -176,6 +190,9 @@ static int take(options *o, const char *name, const char *value) {
                   {"--free-steps", 0, offsetof(options, free_steps)},
                   {"--seed", 0, offsetof(options, seed)},
                   {"--count", 1, offsetof(options, count)}};
+    int known = 0;
+    for (size_t k = 0; option_names[k]; k++) known |= strcmp(name, option_names[k]) == 0;
+    if (!known) return unknown("option", name, option_names);
     if (!value) return complain(name, "", "a value");
     for (size_t k = 0; k < sizeof counts / sizeof *counts; k++)
         if (strcmp(name, counts[k].name) == 0)
@@ -205,7 +222,7 @@ static int take(options *o, const char *name, const char *value) {
         return tss_parse_double(value, strlen(value), &o->budget_ms) == TSS_OK && o->budget_ms > 0
                    ? 1
                    : complain(name, value, "milliseconds > 0");
-    return complain("option", name, "one of those `tss --help` lists");
+    return complain(name, "", "no value");
 }
 
 static int read_options(int argc, char **argv, options *o) {
@@ -230,8 +247,10 @@ static int read_options(int argc, char **argv, options *o) {
         else if (strcmp(argv[k], "--no-full") == 0)
             o->no_full = 1;
         else if (argv[k][0] == '-' && argv[k][1]) {
-            if (!take(o, argv[k], argv[k + 1])) return 0;
-            k++;
+            char *equals = argv[k][1] == '-' ? strchr(argv[k], '=') : NULL;  // --name=value
+            if (equals) *equals = 0;
+            if (!take(o, argv[k], equals ? equals + 1 : argv[k + 1])) return 0;
+            k += !equals;
         } else if (!o->scene)
             o->scene = argv[k];
         else
@@ -1422,6 +1441,7 @@ static int command_run(run *r) {
     r->terminal = isatty(1), r->started = now(NULL);
     if (!read_scene(r) || !choose_field(r) || !build_world(r, &r->w, &r->ipc) || !open_folders(r))
         return 2;
+    if (r->s.neural.given) fprintf(stderr, "tss: %s: `neural` is for `tss neural`; `run` steps the bodies alone\n", r->o.scene);
     r->sub = tss_subspace_of(r->w);
     if (r->o.resume && !read_checkpoint(r)) return 2;
     if (!open_stats(r) || !open_frames(r)) return 2;
@@ -1984,7 +2004,8 @@ int main(int argc, char **argv) {
                     {"neural", command_neural}};
     int which = 0;
     while (which < 5 && argc >= 2 && strcmp(argv[1], commands[which].name) != 0) which++;
-    if (argc < 2 || which == 5) return usage(stderr);
+    if (argc < 2) return usage(stderr);
+    if (which == 5) return unknown("command", argv[1], command_names), 2;
     if (!read_options(argc, argv, &r.o)) return 2;
     int code = commands[which].run(&r);
     if (r.why.text[0]) fprintf(stderr, "tss: %s\n", r.why.text);

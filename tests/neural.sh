@@ -37,7 +37,7 @@ claim "neural: full space is its own reference" '[ "$(value full simulation_erro
 claim "neural: a row a step and method" '[ "$(grep -c "^0," "$out/a/steps_0.csv")" = 80 ]'
 claim "neural: pictures and a page" '[ -s "$out/a/states_0.png" ] && [ -s "$out/a/report.html" ]'
 # Stopped again and again it ends in the same bits.
-claim "neural: stops when its time is up" 'tss train "$out/b" --minutes 0.002 >/dev/null 2>&1; [ $? = 3 ]'
+claim "neural: stops when its time is up" 'tss train "$out/b" --minutes 0.002 >"$build/neural_b.log" 2>&1; [ $? = 3 ] && grep -q "out of --minutes" "$build/neural_b.log"'
 claim "neural: goes on where it stopped" \
     'k=0; while ! tss train "$out/b" --minutes 0.01 >/dev/null 2>&1 && [ $k -lt 200 ]; do k=$((k + 1)); done; [ $k -lt 200 ]'
 for f in frames.bin base_0.tssn vanilla_0.tssn lipschitz_0.tssn; do
@@ -111,5 +111,6 @@ claim "neural: refused: contact" 'refused "contact.enabled is true, expected fal
 claim "neural: refused: an integrator" 'refused "expected \"quasistatic\" or \"euler\"" train "$out/a" --set world.integrator=bdf2'
 claim "neural: refused: frames of another script" 'refused "frames of another scene" train "$out/a" --set neural.script.seed=2'
 claim "neural: refused: another network" 'refused "a network of another scene" evaluate "$out/a" --set neural.hidden=[17]'
+claim "neural: what is not trained is said before anything is made" 'rm -rf "$out/e"; refused "tss neural train .* -o $out/e --seed 3" evaluate "$out/e" --seed 3 && [ ! -e "$out/e/frames.bin" ]'
 claim "neural: refused: a bridge from nothing" 'refused "tss neural train" bridge "$out/a" --seed 7'
 claim "neural: refused: not trained" 'refused "tss neural train" evaluate "$out/a" --seed 7'

@@ -12,4 +12,13 @@ for s in flat press slope twist spiky_terrain; do
     expect "$s" '0 intersections, 0 undecided, 0 inversions' \
         "$build/tss" run "examples/scenes/$s.json" --check --steps 20 -o "$build/example_$s"
 done
+# What a newcomer mistypes.
+expect 'a command that is not there' 'no such command: rn; did you mean "run"' "$build/tss" rn x
+expect 'an option that is not there' 'no such option: --stepz; did you mean "--steps"' "$build/tss" run --stepz 3 x
+expect 'an option without its value' '^tss: --steps: expected a value' "$build/tss" run --steps
+expect 'a value that is not one' '^tss: --steps q: expected a whole number' "$build/tss" run --steps=q x
+expect 'a flag with a value' '^tss: --check: expected no value' "$build/tss" run --check= x
+expect 'a scene that is not there' 'nowhere.json: cannot be read: No such file or directory, expected a scene' "$build/tss" run nowhere.json
+expect 'a folder as a scene' 'examples: cannot be read: Is a directory, expected a scene' "$build/tss" run examples
+expect 'a value after an equals sign' 'flat.json: 3 bodies' "$build/tss" check examples/scenes/flat.json --threads=1
 exit $bad
