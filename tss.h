@@ -2484,7 +2484,7 @@ static void tss__principal_axes(const double *F, double *U, double *V) {
 // C to the nearest PSD matrix: without its negative eigenvalues. Orthogonal changes of basis alter
 // nothing of that, and between F's principal axes an isotropic density has but one 3 × 3 and three
 // 2 × 2 blocks: Jacobi then has next to nothing left to do. Any other density is as right, for a
-// little more. What has no negative eigenvalue stays as it is, to the bit.
+// little more. What has no negative eigenvalue, rounding included, stays as it is, to the bit.
 static void tss__custom_clamp(int d, const double *F, double *C) {
     const int n = d * d;
     double U[9], V[9], T[81], Q[81];

@@ -128,7 +128,7 @@ errors() {
     train "$1" "$2" || return
     rm -f "$work/$1/errors.csv"
     # shellcheck disable=SC2086
-    tss evaluate "$1" "$work/$1" "$2" --no-full ${steps:+--steps $steps} ${cells:+--set neural.solver.cubature=${cells# }} && add "$work/$1/errors.csv" neural_errors.csv && echo "$1, seed $2: neural_errors.csv"
+    tss evaluate "$1" "$work/$1" "$2" --no-full ${steps:+--steps $steps} && add "$work/$1/errors.csv" neural_errors.csv && echo "$1, seed $2: neural_errors.csv"
 }
 
 newton() {
@@ -166,8 +166,8 @@ order() {
 }
 
 runtime() {
-    scenes=$(awk 'match($0, /"cubature": [0-9]+/) {print substr($0, RSTART + 12, RLENGTH - 12)}' "examples/scenes/neural_$1.json")
-    for c in ${cells:-0 "$scenes"}; do
+    trained=$(awk 'match($0, /"cubature": [0-9]+/) {print substr($0, RSTART + 12, RLENGTH - 12)}' "examples/scenes/neural_$1.json")
+    for c in ${cells:-0 "$trained"}; do
         train "$1" "$2" || return
         [ "$c" = 0 ] && there neural_runtime.csv system="$1" seed="$2" && continue
         there neural_runtime.csv system="$1" seed="$2" runtime_cells="$c" && continue

@@ -1536,7 +1536,7 @@ static int neural_train(neural *v) {
     v->prepared = chosen.seconds;
     if (ok && (!only || strcmp(only, "vanilla") == 0)) ok = neural_train_phase(v, NEURAL_VANILLA);
     if (ok && !v->stopped && (!only || strcmp(only, "lipschitz") == 0)) ok = neural_train_phase(v, NEURAL_LIPSCHITZ);
-    if (ok && !v->stopped)
+    if (ok && !v->stopped && !only)  // evaluate wants both
         printf("trained. What comes of it: `tss neural evaluate %s -o %s --seed %d`; with pictures: `run`\n", v->r->o.scene, v->r->o.out,
                v->r->o.seed);
     return ok;

@@ -146,7 +146,7 @@ static const char *const option_names[] = {
     "-o",       "--steps",     "--threads", "--budget-ms", "--frames", "--every",  "--resume",
     "--assets", "--set",       "--check",   "--mode",      "--color",  "--repeat", "--snapshots",
     "--from",   "--free-steps", "--sweep",  "--nodes",     "--modes",  "--tols",   "--name",
-    "--count",  "--seed",      "--minutes", "--method",    "--no-full", "--help",  "--version", NULL};
+    "--count",  "--seed",      "--minutes", "--method",    "--no-full", NULL};
 
 static int unknown(const char *what, const char *name, const char *const *names) {
     char text[200];
@@ -1992,8 +1992,8 @@ static int command_modes(run *r) {
 int main(int argc, char **argv) {
     static run r;
     if (argc >= 2 && strcmp(argv[1], "--version") == 0) return version();
-    if (argc >= 2 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0))
-        return usage(stdout);
+    for (int k = 1; k < argc; k++)
+        if (strcmp(argv[k], "--help") == 0 || strcmp(argv[k], "-h") == 0) return usage(stdout);
     static const struct {
         const char *name;
         int (*run)(run *r);

@@ -15,6 +15,7 @@ done
 # What a newcomer mistypes.
 expect 'a command that is not there' 'no such command: rn; did you mean "run"' "$build/tss" rn x
 expect 'an option that is not there' 'no such option: --stepz; did you mean "--steps"' "$build/tss" run --stepz 3 x
+expect 'help after a command' '^usage: tss run' "$build/tss" run --help
 expect 'an option without its value' '^tss: --steps: expected a value' "$build/tss" run --steps
 expect 'a value that is not one' '^tss: --steps q: expected a whole number' "$build/tss" run --steps=q x
 expect 'a flag with a value' '^tss: --check: expected no value' "$build/tss" run --check= x
