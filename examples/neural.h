@@ -749,7 +749,7 @@ static double *neural_encode_frames(const neural *v, const double *x, int count)
 }
 
 // What the decoder's MLP gives is multiplied by this: with one unit for all modes, each error of a
-// weight moves the stiffest modes, which hardly occur, as far as the softest (neural.md, pca.scale).
+// weight moves the stiffest modes, which hardly occur, as far as the softest (neural_settings.md, pca.scale).
 static void neural_units(neural *v) {
     v->unit = (double *)need((size_t)v->p, sizeof(double));
     v->D = (double *)need((size_t)v->n * (size_t)v->p, sizeof(double));
@@ -1964,7 +1964,7 @@ static int neural_evaluate(neural *v) {
 // of each decoder at the state at hand, and fixed bases of as many columns, each with and without the
 // oracle. All have full space's energy, script and solver tolerance; all columns are active, so that
 // what the oracle adds are nodes. Fixed bases start where full space does. A tangent starts from x_t as
-// it is: what 2x_t − x_{t−1} adds across the manifold, no later tangent takes back (neural.md). If quasi-
+// it is: what 2x_t − x_{t−1} adds across the manifold, no later tangent takes back (neural_settings.md). If quasi-
 // static, where the start is a guess and no more, it is tried too with the start moved onto the manifold
 // ("retracted"). The decoders' own solver runs along.
 // ---------------------------------------------------------------------------------------------

@@ -141,12 +141,50 @@ static int complain(const char *what, const char *value, const char *expected) {
     return 0;
 }
 
+// Commands; those of neural are its actions.
+enum { RUN = 1, CHECK = 2, COMPARE = 4, MODES = 8, TRAIN = 16, PLAY = 32, EVALUATE = 64, MEASURE = 128, BRIDGE = 256 };
+enum { NEURAL = TRAIN | PLAY | EVALUATE | MEASURE | BRIDGE, ALL = RUN | CHECK | COMPARE | MODES | NEURAL };
 static const char *const command_names[] = {"run", "check", "compare", "modes", "neural", NULL};
-static const char *const option_names[] = {
-    "-o",       "--steps",     "--threads", "--budget-ms", "--frames", "--every",  "--resume",
-    "--assets", "--set",       "--check",   "--mode",      "--color",  "--repeat", "--snapshots",
-    "--from",   "--free-steps", "--sweep",  "--nodes",     "--modes",  "--tols",   "--name",
-    "--count",  "--seed",      "--minutes", "--method",    "--no-full", NULL};
+static const char *const actions[] = {"train", "run", "evaluate", "measure", "bridge", NULL};
+
+typedef enum option_kind { FLAG, COUNT, POSITIVE, WORD, OTHER } option_kind;  // COUNT >= 0, POSITIVE >= 1; OTHER: see take
+
+typedef struct option {
+    const char *name;
+    int commands;  // that take it
+    option_kind kind;
+    size_t to;
+} option;
+
+static const option option_table[] = {
+    {"--set", ALL, OTHER, 0},
+    {"--assets", ALL, WORD, offsetof(options, assets)},
+    {"--threads", ALL, POSITIVE, offsetof(options, threads)},
+    {"-o", ALL & ~CHECK, OTHER, 0},
+    {"--steps", RUN | COMPARE | PLAY | EVALUATE | BRIDGE, COUNT, offsetof(options, steps)},
+    {"--mode", RUN | CHECK, OTHER, 0},
+    {"--color", RUN | CHECK, OTHER, 0},
+    {"--frames", RUN, WORD, offsetof(options, frames)},
+    {"--every", RUN, POSITIVE, offsetof(options, every)},
+    {"--budget-ms", RUN, OTHER, 0},
+    {"--resume", RUN, WORD, offsetof(options, resume)},
+    {"--snapshots", RUN, WORD, offsetof(options, snapshots)},
+    {"--check", RUN, FLAG, offsetof(options, check)},
+    {"--from", COMPARE, COUNT, offsetof(options, from)},
+    {"--free-steps", COMPARE, COUNT, offsetof(options, free_steps)},
+    {"--repeat", COMPARE | EVALUATE | BRIDGE, POSITIVE, offsetof(options, repeat)},
+    {"--sweep", COMPARE, FLAG, offsetof(options, sweep)},
+    {"--nodes", COMPARE, WORD, offsetof(options, nodes)},
+    {"--modes", COMPARE, WORD, offsetof(options, modes)},
+    {"--tols", COMPARE, WORD, offsetof(options, tols)},
+    {"--name", COMPARE | NEURAL, WORD, offsetof(options, name)},
+    {"--count", MODES, POSITIVE, offsetof(options, count)},
+    {"--seed", NEURAL, COUNT, offsetof(options, seed)},
+    {"--minutes", TRAIN, OTHER, 0},
+    {"--method", TRAIN, OTHER, 0},
+    {"--no-full", EVALUATE, FLAG, offsetof(options, no_full)}};
+
+enum { OPTIONS = sizeof option_table / sizeof *option_table };
 
 static int unknown(const char *what, const char *name, const char *const *names) {
     char text[200];
@@ -154,6 +192,26 @@ static int unknown(const char *what, const char *name, const char *const *names)
     int near = strncmp(text, "did", 3) == 0;
     fprintf(stderr, "tss: no such %s: %s%s%s (`tss --help` lists all)\n", what, name, near ? "; " : "", near ? text : "");
     return 0;
+}
+
+// The option of a name that this command takes, or NULL, with a complaint.
+static const option *find_option(const options *o, int command, const char *name) {
+    const char *names[OPTIONS + 1] = {NULL};
+    char takers[300] = "";
+    const option *found = NULL;
+    for (int k = 0; k < OPTIONS; k++) {
+        names[k] = option_table[k].name;
+        if (strcmp(name, names[k]) == 0) found = &option_table[k];
+    }
+    if (!found) return unknown("option", name, names), NULL;
+    if (found->commands & command) return found;
+    for (int k = 0; k < 9; k++)  // the first four are commands, the others actions of neural
+        if (found->commands & 1 << k) {
+            size_t used = strlen(takers);
+            snprintf(takers + used, sizeof takers - used, "%s`tss %s%s`", used ? ", " : "", k < 4 ? "" : "neural ", k < 4 ? command_names[k] : actions[k - 4]);
+        }
+    fprintf(stderr, "tss: %s: `tss %s%s%s` does not take it; expected %s\n", name, o->command, o->action ? " " : "", o->action ? o->action : "", takers);
+    return NULL;
 }
 
 static int add_set(options *o, const char *line) {
@@ -177,87 +235,59 @@ static int take_color(options *o, const char *value) {
 }
 
 // One option and its value; 0: bad.
-static int take(options *o, const char *name, const char *value) {
-    static const struct {
-        const char *name;
-        int least;
-        size_t to;
-    } counts[] = {{"--steps", 0, offsetof(options, steps)},
-                  {"--threads", 1, offsetof(options, threads)},
-                  {"--every", 1, offsetof(options, every)},
-                  {"--repeat", 1, offsetof(options, repeat)},
-                  {"--from", 0, offsetof(options, from)},
-                  {"--free-steps", 0, offsetof(options, free_steps)},
-                  {"--seed", 0, offsetof(options, seed)},
-                  {"--count", 1, offsetof(options, count)}};
-    int known = 0;
-    for (size_t k = 0; option_names[k]; k++) known |= strcmp(name, option_names[k]) == 0;
-    if (!known) return unknown("option", name, option_names);
+static int take(options *o, const option *p, const char *value) {
+    void *to = (char *)o + p->to;
+    const char *name = p->name;
     if (!value) return complain(name, "", "a value");
-    for (size_t k = 0; k < sizeof counts / sizeof *counts; k++)
-        if (strcmp(name, counts[k].name) == 0)
-            return whole(value, counts[k].least, (int *)(void *)((char *)o + counts[k].to)) ||
-                   complain(name, value,
-                            counts[k].least ? "a whole number >= 1" : "a whole number >= 0");
+    if (p->kind == WORD) return memcpy(to, &value, sizeof value), 1;
+    if (p->kind == COUNT) return whole(value, 0, (int *)to) || complain(name, value, "a whole number >= 0");
+    if (p->kind == POSITIVE) return whole(value, 1, (int *)to) || complain(name, value, "a whole number >= 1");
     if (strcmp(name, "-o") == 0) return snprintf(o->out, sizeof o->out, "%s", value) > 0;
-    if (strcmp(name, "--assets") == 0) return o->assets = value, 1;
-    if (strcmp(name, "--frames") == 0) return o->frames = value, 1;
-    if (strcmp(name, "--resume") == 0) return o->resume = value, 1;
-    if (strcmp(name, "--snapshots") == 0) return o->snapshots = value, 1;
-    if (strcmp(name, "--name") == 0) return o->name = value, 1;
-    if (strcmp(name, "--nodes") == 0) return o->nodes = value, 1;
-    if (strcmp(name, "--modes") == 0) return o->modes = value, 1;
-    if (strcmp(name, "--tols") == 0) return o->tols = value, 1;
     if (strcmp(name, "--mode") == 0) return take_key(o, "solver.mode", value, o->mode);
     if (strcmp(name, "--color") == 0) return take_color(o, value);
     if (strcmp(name, "--set") == 0) return add_set(o, value);
     if (strcmp(name, "--method") == 0)
         return o->method = value, strcmp(value, "vanilla") == 0 || strcmp(value, "lipschitz") == 0 ||
                                       complain(name, value, "vanilla or lipschitz");
-    if (strcmp(name, "--minutes") == 0)
-        return tss_parse_double(value, strlen(value), &o->minutes) == TSS_OK && o->minutes > 0
-                   ? 1
-                   : complain(name, value, "minutes > 0");
-    if (strcmp(name, "--budget-ms") == 0)
-        return tss_parse_double(value, strlen(value), &o->budget_ms) == TSS_OK && o->budget_ms > 0
-                   ? 1
-                   : complain(name, value, "milliseconds > 0");
-    return complain(name, "", "no value");
+    double *number = strcmp(name, "--minutes") == 0 ? &o->minutes : &o->budget_ms;
+    return (tss_parse_double(value, strlen(value), number) == TSS_OK && *number > 0) ||
+           complain(name, value, number == &o->minutes ? "minutes > 0" : "milliseconds > 0");
 }
 
-static int read_options(int argc, char **argv, options *o) {
+static int read_options(int argc, char **argv, int command, options *o) {
+    int sweeps = 0;
     memset(o, 0, sizeof *o);
     o->steps = o->free_steps = -1, o->repeat = 1;
     o->nodes = "1,0.5,0.2,0.1,0.05,0.02", o->modes = "0.5,0.05";
     o->command = argv[1];
     int first = 2;
-    if (strcmp(o->command, "neural") == 0) {
-        o->action = argc > 2 ? argv[2] : "";
-        static const char *const actions[] = {"train", "run", "evaluate", "measure", "bridge"};
+    if (command == NEURAL) {
         int k = 0;
-        while (k < 5 && strcmp(o->action, actions[k]) != 0) k++;
-        if (k == 5) return complain("neural", o->action, "train, run, evaluate, measure or bridge");
-        first = 3;
+        o->action = argc > 2 ? argv[2] : "";
+        while (actions[k] && strcmp(o->action, actions[k]) != 0) k++;
+        if (!actions[k]) return complain("neural", o->action, "train, run, evaluate, measure or bridge");
+        command = TRAIN << k, first = 3;
     }
     for (int k = first; k < argc; k++) {
-        if (strcmp(argv[k], "--check") == 0)
-            o->check = 1;
-        else if (strcmp(argv[k], "--sweep") == 0)
-            o->sweep = 1;
-        else if (strcmp(argv[k], "--no-full") == 0)
-            o->no_full = 1;
-        else if (argv[k][0] == '-' && argv[k][1]) {
+        if (argv[k][0] == '-' && argv[k][1]) {
             char *equals = argv[k][1] == '-' ? strchr(argv[k], '=') : NULL;  // --name=value
             if (equals) *equals = 0;
-            if (!take(o, argv[k], equals ? equals + 1 : argv[k + 1])) return 0;
+            const option *p = find_option(o, command, argv[k]);
+            if (!p) return 0;
+            sweeps |= p->to == offsetof(options, nodes) || p->to == offsetof(options, modes) || p->to == offsetof(options, tols);
+            if (p->kind == FLAG) {
+                if (equals) return complain(p->name, "", "no value");
+                *(int *)(void *)((char *)o + p->to) = 1;
+                continue;
+            }
+            if (!take(o, p, equals ? equals + 1 : argv[k + 1])) return 0;
             k += !equals;
         } else if (!o->scene)
             o->scene = argv[k];
         else
             return complain("argument", argv[k], "one scene");
     }
-    if (o->no_full && (!o->action || strcmp(o->action, "evaluate") != 0))
-        return complain("--no-full", "", "`tss neural evaluate`");
+    if (sweeps && !o->sweep) return complain("--nodes, --modes, --tols", "", "--sweep beside them");
     return o->scene ? 1 : complain(o->command, "", "a scene");
 }
 
@@ -1994,20 +2024,13 @@ int main(int argc, char **argv) {
     if (argc >= 2 && strcmp(argv[1], "--version") == 0) return version();
     for (int k = 1; k < argc; k++)
         if (strcmp(argv[k], "--help") == 0 || strcmp(argv[k], "-h") == 0) return usage(stdout);
-    static const struct {
-        const char *name;
-        int (*run)(run *r);
-    } commands[] = {{"run", command_run},
-                    {"check", command_check},
-                    {"compare", command_compare},
-                    {"modes", command_modes},
-                    {"neural", command_neural}};
+    static int (*const commands[])(run *r) = {command_run, command_check, command_compare, command_modes, command_neural};
     int which = 0;
-    while (which < 5 && argc >= 2 && strcmp(argv[1], commands[which].name) != 0) which++;
+    while (command_names[which] && argc >= 2 && strcmp(argv[1], command_names[which]) != 0) which++;
     if (argc < 2) return usage(stderr);
-    if (which == 5) return unknown("command", argv[1], command_names), 2;
-    if (!read_options(argc, argv, &r.o)) return 2;
-    int code = commands[which].run(&r);
+    if (!command_names[which]) return unknown("command", argv[1], command_names), 2;
+    if (!read_options(argc, argv, which == 4 ? NEURAL : 1 << which, &r.o)) return 2;
+    int code = commands[which](&r);
     if (r.why.text[0]) fprintf(stderr, "tss: %s\n", r.why.text);
     run_free(&r);
     return code;

@@ -19,6 +19,8 @@ expect 'help after a command' '^usage: tss run' "$build/tss" run --help
 expect 'an option without its value' '^tss: --steps: expected a value' "$build/tss" run --steps
 expect 'a value that is not one' '^tss: --steps q: expected a whole number' "$build/tss" run --steps=q x
 expect 'a flag with a value' '^tss: --check: expected no value' "$build/tss" run --check= x
+expect 'an option of another command' '^tss: --minutes: `tss neural run` does not take it; expected `tss neural train`$' "$build/tss" neural run x --minutes 3
+expect 'a list without --sweep' 'expected --sweep' "$build/tss" compare x --nodes 1
 expect 'a scene that is not there' 'nowhere.json: cannot be read: No such file or directory, expected a scene' "$build/tss" run nowhere.json
 expect 'a folder as a scene' 'examples: cannot be read: Is a directory, expected a scene' "$build/tss" run examples
 expect 'a value after an equals sign' 'flat.json: 3 bodies' "$build/tss" check examples/scenes/flat.json --threads=1
