@@ -398,6 +398,8 @@ static int neural_open(run *r, neural *v) {
         return fail(r, "%s: neural.train.start is \"linear\", expected \"random\" where nothing is supervised", r->o.scene);
     if (v->d->lipschitz.whiten_end && v->d->unsupervised)
         return fail(r, "%s: neural.lipschitz.whiten_end is true, expected false where nothing is supervised", r->o.scene);
+    if (v->d->lipschitz.unit != 1 && !v->d->lipschitz.whiten)
+        return fail(r, "%s: neural.lipschitz.unit is %g, expected 1 without whiten", r->o.scene, v->d->lipschitz.unit);
     for (int k = 0; v->d->train.start && k < v->d->layers; k++)
         if (v->d->hidden[k] < v->d->r)
             return fail(r, "%s: neural.hidden[%d] is %d, expected at least neural.r (%d) with train.start \"linear\"", r->o.scene, k,
@@ -932,8 +934,14 @@ static int neural_read(neural *v, neural_phase phase, tss_model *m, int *there) 
                 path, v->r->o.scene);
 }
 
+// The phase is over, and its z was changed at its end, when Adam began anew.
+static int neural_changed(const neural *v, neural_phase phase, const tss_model *m) {
+    return phase == NEURAL_LIPSCHITZ && m->adam && m->step > (uint64_t)v->d->train.steps && tss_adam_steps(m->adam) == 0;
+}
+
 // z of frames (count × n): encoded; unsupervised: N(0, I), times S where z has been whitened.
 static double *neural_z(neural *v, const tss_model *m, neural_phase phase, const double *x, int count) {
+    double unit = neural_changed(v, phase, m) ? 1 / sqrt(v->d->lipschitz.unit) : 1;
     const double *S = phase == NEURAL_LIPSCHITZ && v->d->lipschitz.whiten ? v->S : NULL;
     int r = v->d->r;
     double *z = (double *)need((size_t)count * (size_t)v->d->r, sizeof *z);
@@ -946,7 +954,7 @@ static double *neural_z(neural *v, const tss_model *m, neural_phase phase, const
     for (int k = 0; S && k < count; k++) {
         double n[1000];
         memcpy(n, z + k * r, (size_t)r * sizeof *n);
-        for (int i = 0; i < r * r; i++) z[k * r + i / r] = (i % r ? z[k * r + i / r] : 0) + S[i] * n[i % r];
+        for (int i = 0; i < r * r; i++) z[k * r + i / r] = (i % r ? z[k * r + i / r] : 0) + unit * S[i] * n[i % r];
     }
     return z;
 }
@@ -1402,6 +1410,9 @@ static int neural_trainer_open(neural *v, neural_phase phase, neural_trainer *t)
     t->last = t->first + (uint64_t)(phase == NEURAL_BASE ? v->d->train.steps : v->d->lipschitz.steps);
     tss_adam_def a = neural_adam(t);
     if (!neural_read(v, phase, &t->m, &there)) return 0;
+    if (there && t->m.step < t->last && neural_changed(v, phase, &t->m))
+        return fail(v->r, "%s/lipschitz_%d.tssn: ended after %llu steps, and its z was changed then; expected neural.lipschitz.steps %llu, or no such file",
+                    v->r->o.out, v->r->o.seed, (unsigned long long)(t->m.step - t->first), (unsigned long long)(t->m.step - t->first));
     // its model's z is y already; how y is spread is asked for where there is no encoder
     if (phase == NEURAL_LIPSCHITZ && (!there || v->d->unsupervised) && !neural_whitening_read(v)) return 0;
     if (!there && phase == NEURAL_BASE && !neural_fresh(v, &t->m)) return 0;
@@ -1453,10 +1464,11 @@ static int neural_checkpoint(neural_trainer *t) {
     return r == TSS_OK ? 1 : fail(v->r, "%s: cannot be written: %s", path, tss_result_text(r));
 }
 
-// The phase is over but for the whitening at its end, which has no checkpoint before it: one that is killed
+// The phase is over but for the change of z at its end, which has no checkpoint before it: one that is killed
 // in it takes its last steps again.
-static int neural_unwhitened(const neural_trainer *t) {
-    return t->phase == NEURAL_LIPSCHITZ && t->v->d->lipschitz.whiten_end && t->m.step == t->last;
+static int neural_unchanged(const neural_trainer *t) {
+    const scene_neural *d = t->v->d;
+    return t->phase == NEURAL_LIPSCHITZ && (d->lipschitz.whiten_end || d->lipschitz.unit != 1) && t->m.step == t->last;
 }
 
 static int neural_train_loop(neural_trainer *t) {
@@ -1472,7 +1484,7 @@ static int neural_train_loop(neural_trainer *t) {
         t->rate = i.rate, t->skipped += i.skipped;
         double spent = now(NULL) - start;
         t->seconds = before + spent;
-        if (((t->m.step - t->first) % every == 0 || now(NULL) > saved + 60) && !neural_unwhitened(t)) {
+        if (((t->m.step - t->first) % every == 0 || now(NULL) > saved + 60) && !neural_unchanged(t)) {
             if (!neural_checkpoint(t)) return 0;
             saved = now(NULL);
         }
@@ -1481,30 +1493,44 @@ static int neural_train_loop(neural_trainer *t) {
                         (unsigned long long)(t->m.step - t->first), (unsigned long long)(t->last - t->first), t->loss,
                         t->lipschitz, t->lip, spent / (double)(t->m.step - begun) * (double)(t->last - t->m.step));
     }
-    return t->m.step == begun || neural_unwhitened(t) || neural_checkpoint(t);
+    return t->m.step == begun || neural_unchanged(t) || neural_checkpoint(t);
 }
 
-// lipschitz.whiten_end: the trained decoder in coordinates in which the harmonic mean of its own Hessians is a
-// multiple of 1, and the largest eigenvalue of their mean is 1: a first step of −∇E is not too long.
-static int neural_whiten_end(neural_trainer *t) {
+// lipschitz.whiten_end: z = T y, in which the harmonic mean of the trained decoder's Hessians is a multiple of
+// 1, and the largest eigenvalue of their mean is 1: a first step of −∇E is not too long.
+static int neural_whiten_end(neural_trainer *t, double *T) {
     neural *v = t->v;
     int r = v->d->r, count = neural_whiten_states(v);
     size_t rr = (size_t)(r * r);
     double *x = neural_spread(v, v->train, v->trains, count), *z = neural_z(v, &t->m, NEURAL_VANILLA, x, count);
-    double *A = (double *)need(5 * rr, sizeof *A), *T = A + rr, *S = T + rr, *mean = S + rr, *E = mean + rr, most = 0, began = now(NULL);
-    tss_adam_def adam = neural_adam(t);
+    double *A = (double *)need(4 * rr, sizeof *A), *S = A + rr, *mean = S + rr, *E = mean + rr, most = 0, began = now(NULL);
     int ok = neural_mean_hessian(v, &t->m, 1, A, count, x, z, mean);
     if (ok) {
         neural_roots(r, A, T, S);
         neural_times(r, mean, T, E), neural_times(r, T, E, mean), neural_jacobi(r, mean, E);
         for (int q = 0; q < r; q++) most = fmax(most, mean[q * (r + 1)]);
         for (size_t i = 0; i < rr; i++) T[i] /= sqrt(most);
+        printf("whitened at the end: %d states, %.1f s\n", count, now(NULL) - began);
     }
+    free(x), free(z), free(A);
+    return ok;
+}
+
+// The change of z at the end: that, and lipschitz.unit, in which L-BFGS's first step of −∇E is shorter, and
+// |∇E| per unit smaller, where it is below 1.
+static int neural_change_end(neural_trainer *t) {
+    neural *v = t->v;
+    int r = v->d->r;
+    double *T = (double *)need((size_t)(r * r), sizeof *T), began = now(NULL);
+    tss_adam_def adam = neural_adam(t);
+    for (int i = 0; i < r; i++) T[i * (r + 1)] = 1;
+    int ok = !v->d->lipschitz.whiten_end || neural_whiten_end(t, T);
+    for (int i = 0; i < r * r; i++) T[i] *= sqrt(v->d->lipschitz.unit);
     ok = ok && (tss_model_change_z(&t->m, T) == TSS_OK || fail(v->r, "%s: neural.lipschitz.whiten_end: the mean Hessian is singular", v->r->o.scene));
     if (ok && tss_adam_set(t->m.adam, &adam, 1) != TSS_OK) ok = fail(v->r, "%s: neural.lipschitz: bad rates", v->r->o.scene);
-    free(x), free(z), free(A);
-    if (ok) neural_sync(t), t->seconds += now(NULL) - began;
-    if (ok) printf("whitened at the end: %d states, %.1f s\n", count, now(NULL) - began);
+    free(T);
+    if (ok && t->decoder) neural_sync(t);
+    t->seconds += now(NULL) - began;
     return ok && neural_checkpoint(t);
 }
 
@@ -1513,7 +1539,7 @@ static int neural_train_phase(neural *v, neural_phase phase) {
     int ok = neural_trainer_open(v, phase, &t);
     uint64_t begun = t.m.step;
     ok = ok && neural_train_loop(&t);
-    if (ok && neural_unwhitened(&t) && t.m.step > begun) ok = neural_whiten_end(&t);
+    if (ok && neural_unchanged(&t) && t.m.step > begun) ok = neural_change_end(&t);
     if (ok && t.loss > 0)
         printf("%s: step %llu, %.1f s, loss %.6g, Lip %.6g\n", neural_phases[phase], (unsigned long long)t.m.step, t.seconds, t.loss, t.lip);
     if (ok && t.loss > 0 && t.m.encoder) printf("%s: loss of the test frames %.6g\n", neural_phases[phase], t.loss_test);

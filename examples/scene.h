@@ -133,7 +133,8 @@
                            groups of frames this near under one's handles (0: off), whiten: in
                            coordinates in which the mean Hessian of the base is 1 (false), whiten_at: frames |
                            solver: at the states of this mean (frames), whiten_end: once more, by the
-                           harmonic mean of the trained decoder's, supervised (false), cubature: cells,
+                           harmonic mean of the trained decoder's, supervised (false), unit: J,
+                           the whitened Hessian in the z that the phase ends with (1), cubature: cells,
                            0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
                            (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0)}
@@ -271,7 +272,7 @@ typedef struct scene_neural {
     } train;
     struct {
         int steps, batch, warmup, order, estimator, probes, undivided, through_encoder, relative, handles, window, cubature, samples, whiten, whiten_at, whiten_end;
-        double rate, rate_end, weight;
+        double rate, rate_end, weight, unit;
     } lipschitz;
     struct {
         int kind, memory, max_line, max_iterations, cubature;
@@ -1884,6 +1885,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten, "whiten"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten_end, "whiten_end"),
     SCENE__ONE(scene_neural, lipschitz.whiten_at, "whiten_at", scene__whiten_states),
+    SCENE__POS(scene_neural, lipschitz.unit, "unit"),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
     SCENE__END};
@@ -1942,7 +1944,7 @@ static void scene__neural_defaults(scene_neural *n) {
     n->lipschitz.steps = 5000, n->lipschitz.batch = 16, n->lipschitz.rate = 1e-4;
     n->lipschitz.rate_end = 1e-6, n->lipschitz.weight = 1e-3, n->lipschitz.order = 2;
     n->lipschitz.estimator = 2, n->lipschitz.probes = 1, n->lipschitz.through_encoder = 1;
-    n->lipschitz.samples = 64, n->lipschitz.handles = 1;
+    n->lipschitz.samples = 64, n->lipschitz.handles = 1, n->lipschitz.unit = 1;
     n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9, n->solver.memory = 10;
     n->solver.max_line = 128, n->solver.max_iterations = 1024;
 }

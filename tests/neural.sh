@@ -69,6 +69,15 @@ claim "neural: whitened at the end" 'solver="$still --set neural.lipschitz.white
     tss train "$out/m" $solver >"$build/neural_m.log" 2>&1 && tss evaluate "$out/m" $solver --no-full >>"$build/neural_m.log" 2>&1 &&
     grep -q "^whitened at the end: 200 states" "$build/neural_m.log" && less "$(of2 lipschitz evaluations)" "$(of2 vanilla evaluations)" &&
     near "$(of2 lipschitz simulation_error)" "$(of2 vanilla simulation_error)" 1e-3 && near "$(of2 lipschitz projection_error)" "$(of2 vanilla projection_error)" 1e-4'
+# A unit of z: |∇E| and E's Hessian per unit change, no state does; Lip is per unit cubed.
+share() { awk -v a="$1" -v b="$2" -v q="$3" 'BEGIN {exit !(a > 0 && b > 0 && a / b > q * (1 - 1e-3) && a / b < q * (1 + 1e-3))}'; }
+# shellcheck disable=SC2086
+claim "neural: the unit of z" 'lip=$(of2 lipschitz lip) spread=$(of2 lipschitz z_scale) sim=$(of2 lipschitz simulation_error); rm "$out/m/evaluate.csv" "$out/m/lipschitz_0.tssn"
+    solver="$still --set neural.lipschitz.whiten=true --set neural.lipschitz.whiten_end=true --set neural.lipschitz.unit=0.01"
+    tss train "$out/m" $solver >"$build/neural_m.log" 2>&1 && tss evaluate "$out/m" $solver --no-full >>"$build/neural_m.log" 2>&1 &&
+    share "$lip" "$(of2 lipschitz lip)" 1000 && share "$spread" "$(of2 lipschitz z_scale)" 0.1 && near "$(of2 lipschitz simulation_error)" "$sim" 1e-3'
+# shellcheck disable=SC2086
+claim "neural: refused: longer than its end" '! tss train "$out/m" $solver --set neural.lipschitz.steps=100000 >"$build/neural_bad.log" 2>&1 && grep -q "lipschitz_0.tssn: ended after .* or no such file" "$build/neural_bad.log"'
 claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
     "$build/tss" neural evaluate examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
@@ -97,9 +106,14 @@ cloth() {
 }
 claim "neural: cloth and a ball" 'cloth train && cloth evaluate && cloth run && [ -s "$out/d/states_0.png" ]'
 claim "neural: cloth: full space converges" '[ "$(awk -F, "\$2 == \"full\" {print \$10, \$13}" "$out/d/evaluate.csv")" = "15 0" ]'
+# of4 COLUMN of the Lipschitz row of a cloth trained with such a unit
+of4() { awk -F, -v c="$1" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == "lipschitz" {print $k}' "$out/d/evaluate.csv"; }
+again() { rm "$out/d/evaluate.csv" "$out/d/lipschitz_0.tssn"; cloth train --set neural.lipschitz.unit="$1" && cloth evaluate --no-full --set neural.lipschitz.unit="$1"; }
+claim "neural: the unit of z without an encoder" 'again 1 && lip=$(of4 lip) spread=$(of4 z_scale) && again 0.01 && share "$lip" "$(of4 lip)" 1000 && share "$spread" "$(of4 z_scale)" 0.1'
 claim "neural: refused: the bridge of a shell" '! cloth bridge && grep -q "bridge: bodies\[0\].shell: expected a body of tetrahedra" "$build/neural_d.log"'
 bad_cloth() { words=$1; shift; cloth train "$@"; [ $? = 2 ] && grep -q -e "$words" "$build/neural_d.log"; }
 claim "neural: refused: a shell of tets" 'bad_cloth "expected a soft surface of triangles" --set bodies.0.shape.kind=box --set bodies.0.shape.upper=[1,1,1]'
+claim "neural: refused: a unit without whitening" 'bad_cloth "unit is 0.5, expected 1 without whiten" --set neural.lipschitz.whiten=false --set neural.lipschitz.unit=0.5'
 claim "neural: refused: a ball without a radius" 'bad_cloth "radius" --set neural.script.ball.radius=0'
 claim "neural: refused: a ball that meets no shell" 'refused "expected a first body with \"shell\"" train "$out/a" --set neural.script.ball.radius=1 --set neural.script.ball.stiffness=1'
 claim "neural: refused: another action" 'refused "expected train, run, evaluate, measure or bridge" walk "$out/a"'
