@@ -656,7 +656,7 @@ static void neural_methods(source *s, report *r) {
                 "the best linear subspace of the same r, and in full space. Errors are distances over the diagonal of "
                 "the rest shape, the mean of nodes and states: from the nearest state that the decoder reaches, and "
                 "from the full-space run beside it. Numbers are means over seeds. All lipschitz rows but pulled_bar's have "
-                "lipschitz.whiten too, a departure from the paper that most of the gain comes from; the networks of dinosaur, dinosaur_small, elephant and bunny, "
+                "lipschitz.whiten and lipschitz.unit too, departures from the paper that most of the gain comes from (Lip has the unit of z: its relative column has not); the networks of dinosaur, dinosaur_small, elephant and bunny, "
                 "vanilla's too, began as the linear subspace (docs/neural.md).");
     if (*t.comment) report_code(r, t.comment);
     neural_means(r, &t, -1, NULL, c, (int)(sizeof c / sizeof *c));
