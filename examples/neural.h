@@ -1621,6 +1621,16 @@ static int neural_linear(neural *v, tss_model *m) {
     return 1;
 }
 
+// solver.stretch: what vanilla and the linear subspace gain in another unit of z. Their states stay.
+static int neural_stretch(neural *v, tss_model *m) {
+    int r = v->d->r;
+    double *T = (double *)need((size_t)(r * r), sizeof *T);
+    for (int i = 0; i < r; i++) T[i * (r + 1)] = 1 / v->d->solver.stretch;
+    tss_result e = v->d->solver.stretch == 1 ? TSS_OK : tss_model_change_z(m, T);
+    free(T);
+    return e == TSS_OK ? 1 : fail(v->r, "%s: neural.solver.stretch: %s", v->r->o.scene, tss_result_text(e));
+}
+
 static int neural_entry_open(neural_trial *t, int which) {
     neural *v = t->v;
     neural_entry *e = &t->e[which];
@@ -1642,6 +1652,7 @@ static int neural_entry_open(neural_trial *t, int which) {
     neural_selection chosen;
     if (which == NEURAL_TRIAL_LIPSCHITZ && d->unsupervised && !neural_whitening_read(v)) return 0;
     if (!neural_cubature(v, &e->m, which == NEURAL_TRIAL_LIPSCHITZ ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, d->solver.cubature, &e->cells, &chosen)) return 0;
+    if (which != NEURAL_TRIAL_LIPSCHITZ && !neural_stretch(v, &e->m)) return 0;
     tss_reduced_def rd = neural_solver(v, e->m.decoder, e->cells);
     tss_host host = tss_host_default();
     host.log = print_log, host.workers = v->r->o.threads;
@@ -1877,6 +1888,7 @@ static int neural_lip(neural_trial *t, neural_entry *e) {
     if (!v->d->unsupervised && count > v->tests) count = v->tests;
     double *z = neural_z(v, &e->m, e == &t->e[NEURAL_TRIAL_LIPSCHITZ] ? NEURAL_LIPSCHITZ : NEURAL_VANILLA, x, count);
     tss_result r = TSS_OK;
+    for (int i = 0; i < count * v->d->r && !e->m.encoder && e == &t->e[NEURAL_TRIAL_VANILLA]; i++) z[i] *= v->d->solver.stretch;
     for (int o = 0; o < 3 && r == TSS_OK; o++) r = neural_eq7(v, &e->m, v->elements, 1, o, count, x, z, &e->lip[o]);
     e->lip_decoder = e->lip[2];
     if (v->pinned && r == TSS_OK) r = neural_eq7(v, &e->m, v->elements, 0, 2, count, x, z, &e->lip_decoder);

@@ -137,7 +137,8 @@
                            the whitened Hessian in the z that the phase ends with (1), cubature: cells,
                            0: all (0), samples: that choose them (64)}
     .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
-                           (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0)}
+                           (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0),
+                           stretch: evaluate steps vanilla and linear in z times this (1)}
     .samples               of Eq. 7 (256)
 
    IPC SCRIPTS  time density stiffness energy timeIntegration dampingStiff dampingRatio
@@ -276,7 +277,7 @@ typedef struct scene_neural {
     } lipschitz;
     struct {
         int kind, memory, max_line, max_iterations, cubature;
-        double eps, ftol;
+        double eps, ftol, stretch;
     } solver;
 } scene_neural;
 
@@ -1885,7 +1886,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten, "whiten"),
     SCENE__OF(SCENE__FLAG, scene_neural, lipschitz.whiten_end, "whiten_end"),
     SCENE__ONE(scene_neural, lipschitz.whiten_at, "whiten_at", scene__whiten_states),
-    SCENE__POS(scene_neural, lipschitz.unit, "unit"),
+    SCENE__NUM(scene_neural, lipschitz.unit, "unit", 1e-9, 1e9),
     SCENE__INT(scene_neural, lipschitz.cubature, "cubature", 0, 1e6),
     SCENE__INT(scene_neural, lipschitz.samples, "samples", 1, 1e5),
     SCENE__END};
@@ -1897,6 +1898,7 @@ static const scene__key scene__reduced_keys[] = {
     SCENE__INT(scene_neural, solver.max_line, "max_line", 1, 1e6),
     SCENE__INT(scene_neural, solver.max_iterations, "max_iterations", 1, 1e9),
     SCENE__INT(scene_neural, solver.cubature, "cubature", 0, 1e6),
+    SCENE__NUM(scene_neural, solver.stretch, "stretch", 1e-6, 1e6),
     SCENE__END};
 
 static int scene__read_script_of(scene__reader *r, const cJSON *v, void *base) {
@@ -1945,7 +1947,7 @@ static void scene__neural_defaults(scene_neural *n) {
     n->lipschitz.rate_end = 1e-6, n->lipschitz.weight = 1e-3, n->lipschitz.order = 2;
     n->lipschitz.estimator = 2, n->lipschitz.probes = 1, n->lipschitz.through_encoder = 1;
     n->lipschitz.samples = 64, n->lipschitz.handles = 1, n->lipschitz.unit = 1;
-    n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9, n->solver.memory = 10;
+    n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9, n->solver.stretch = 1, n->solver.memory = 10;
     n->solver.max_line = 128, n->solver.max_iterations = 1024;
 }
 

@@ -77,6 +77,10 @@ claim "neural: the unit of z" 'lip=$(of2 lipschitz lip) spread=$(of2 lipschitz z
     tss train "$out/m" $solver >"$build/neural_m.log" 2>&1 && tss evaluate "$out/m" $solver --no-full >>"$build/neural_m.log" 2>&1 &&
     share "$lip" "$(of2 lipschitz lip)" 1000 && share "$spread" "$(of2 lipschitz z_scale)" 0.1 && near "$(of2 lipschitz simulation_error)" "$sim" 1e-3'
 # shellcheck disable=SC2086
+claim "neural: vanilla in another unit" 'lip=$(of2 vanilla lip) spread=$(of2 vanilla z_scale) sim=$(of2 vanilla simulation_error) lin=$(of2 linear simulation_error); rm "$out/m/evaluate.csv"
+    tss evaluate "$out/m" $solver --no-full --set neural.solver.stretch=10 >"$build/neural_m.log" 2>&1 && share "$lip" "$(of2 vanilla lip)" 1000 &&
+    share "$spread" "$(of2 vanilla z_scale)" 0.1 && near "$(of2 vanilla simulation_error)" "$sim" 1e-3 && near "$(of2 linear simulation_error)" "$lin" 1e-3'
+# shellcheck disable=SC2086
 claim "neural: refused: longer than its end" '! tss train "$out/m" $solver --set neural.lipschitz.steps=100000 >"$build/neural_bad.log" 2>&1 && grep -q "lipschitz_0.tssn: ended after .* or no such file" "$build/neural_bad.log"'
 claim "neural: unsupervised" '"$build/tss" neural train examples/scenes/neural_bistable.json -o "$out/c" --set bodies.0.shape.cells=[8,2] \
     --set neural.script.length=20 --set neural.train.steps=200 --set neural.lipschitz.steps=50 >"$build/neural_c.log" 2>&1 &&
@@ -110,6 +114,8 @@ claim "neural: cloth: full space converges" '[ "$(awk -F, "\$2 == \"full\" {prin
 of4() { awk -F, -v c="$1" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == "lipschitz" {print $k}' "$out/d/evaluate.csv"; }
 again() { rm "$out/d/evaluate.csv" "$out/d/lipschitz_0.tssn"; cloth train --set neural.lipschitz.unit="$1" && cloth evaluate --no-full --set neural.lipschitz.unit="$1"; }
 claim "neural: the unit of z without an encoder" 'again 1 && lip=$(of4 lip) spread=$(of4 z_scale) && again 0.01 && share "$lip" "$(of4 lip)" 1000 && share "$spread" "$(of4 z_scale)" 0.1'
+claim "neural: vanilla in another unit, without an encoder" 'of4v() { awk -F, -v c="$1" "/^system,/ {for (i = 1; i <= NF; i++) if (\$i == c) k = i} \$2 == \"vanilla\" {print \$k}" "$out/d/evaluate.csv"; }
+    lip=$(of4v lip); rm "$out/d/evaluate.csv"; cloth evaluate --no-full --set neural.lipschitz.unit=0.01 --set neural.solver.stretch=10 && share "$lip" "$(of4v lip)" 1000'
 claim "neural: refused: the bridge of a shell" '! cloth bridge && grep -q "bridge: bodies\[0\].shell: expected a body of tetrahedra" "$build/neural_d.log"'
 bad_cloth() { words=$1; shift; cloth train "$@"; [ $? = 2 ] && grep -q -e "$words" "$build/neural_d.log"; }
 claim "neural: refused: a shell of tets" 'bad_cloth "expected a soft surface of triangles" --set bodies.0.shape.kind=box --set bodies.0.shape.upper=[1,1,1]'
