@@ -1134,6 +1134,15 @@ static void neural_times(int r, const double *A, const double *B, double *C) {
     }
 }
 
+// A sequence begins at rest, as near to x as the decoder comes from g(x), or from 0 without an encoder: from
+// the end of the sequence before a projection may end on another branch.
+static tss_result neural_rest(neural *v, const tss_model *m, tss_reduced *s, const double *x) {
+    double *z = m->encoder ? neural_z(v, m, NEURAL_VANILLA, x, 1) : (double *)need((size_t)v->d->r, sizeof *z);
+    (void)tss_reduced_set(s, z);
+    free(z);
+    return tss_reduced_project(s, x, NULL);
+}
+
 // States in which the solver ends: the first steps of some training sequences. Returns how many, 0: failed.
 static int neural_solved(neural *v, const tss_model *m, double *x, double *z) {
     tss_reduced_def rd = neural_solver(v, m->decoder, NULL);
@@ -1149,7 +1158,7 @@ static int neural_solved(neural *v, const tss_model *m, double *x, double *z) {
     for (int q = 0; ok && q < NEURAL_SOLVED && q < v->d->script.train; q++) {
         neural_script script = neural_script_of(v, v->d->script.test + q);
         (void)tss_reduced_set_handles(s, 0, NULL, NULL);
-        ok = tss_reduced_project(s, v->x0, NULL) == TSS_OK;
+        ok = neural_rest(v, m, s, v->x0) == TSS_OK;
         for (int k = 0; ok && k < steps; k++) {
             int at = v->d->script.stride * (k + 1) - 1;
             memcpy(v->ball.center, script.center + 3 * at, sizeof v->ball.center);
@@ -1782,10 +1791,7 @@ static int neural_trial_sequence(neural_trial *t, int number, const neural_start
         if (!t->e[q].used) continue;
         const double *from = settle ? neural_truth(t, number, settle - 1) : v->x0;
         (void)tss_reduced_set_handles(t->e[q].s, 0, NULL, NULL);
-        double *z = settle && t->e[q].m.encoder ? neural_z(v, &t->e[q].m, NEURAL_VANILLA, from, 1) : NULL;
-        if (z) (void)tss_reduced_set(t->e[q].s, z);
-        free(z);
-        tss_result r = tss_reduced_project(t->e[q].s, from, NULL);
+        tss_result r = neural_rest(v, &t->e[q].m, t->e[q].s, from);
         if (r != TSS_OK) ok = fail(v->r, "%s: the start cannot be projected: %s", v->r->o.scene, tss_result_text(r));
     }
     if (ok && t->bridges) ok = neural_bridges_begin(t);
