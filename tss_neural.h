@@ -27,7 +27,8 @@
  *
  * tss_cubature_select (Eq. 11) finds few cells that stand for all of them in training; tss_reduced
  * (Eq. 2) simulates with a trained decoder, with scripted handles and contact against a signed
- * distance; tss_decoder_basis makes it a basis of the adaptive simulator (tss_subspace.h).
+ * distance, by the paper's L-BFGS, projected Newton, or a BFGS that remembers (the default);
+ * tss_decoder_basis makes it a basis of the adaptive simulator (tss_subspace.h).
  *
  * Jets: for directions D_a, a < k, and one symmetric matrix C (k × k) a pass carries
  *     y,   y_a = ∂_a y,   y_2 = Σ_ab C_ab ∂_a ∂_b y
@@ -413,8 +414,8 @@ typedef struct tss_training_def {
     int lipschitz_batch;          // samples of L_LS, >= 2; default 16
     tss_lipschitz_def lipschitz;  // its held is not used: supervised, the coordinates below are
                                   // where the frame has them in L_LS
-    int held_count;       // default 0
-    const int *held;      // coordinates, each once; borrowed
+    int held_count;               // default 0
+    const int *held;              // coordinates, each once; borrowed
     int through_encoder;  // supervised: L_LS also moves the encoder through z = g(x); default 1
     tss_adam_def adam;
     int cookie;
@@ -450,7 +451,7 @@ TSS_API tss_result tss_training_step(tss_training *t, tss_training_info *info);
 // ---------------------------------------------------------------------------------------------
 
 typedef enum tss_exit {    // the paper's four (§5)
-    TSS_EXIT_CONVERGED,    // ‖∇E‖∞ <= eps
+    TSS_EXIT_CONVERGED,    // ‖∇E‖∞ <= eps; BFGS: f would move by no more than tol
     TSS_EXIT_SADDLE,       // E fell by less than ftol |E|
     TSS_EXIT_LINE_SEARCH,  // max_line trials without enough decrease
     TSS_EXIT_ITERATIONS,   // max_iterations
@@ -458,7 +459,11 @@ typedef enum tss_exit {    // the paper's four (§5)
 } tss_exit;
 
 typedef enum tss_reduced_method {
-    TSS_LBFGS,
+    // Quasi-Newton with an inverse Hessian that stays from step to step (until tss_reduced_set or
+    // _project), since E's Hessian changes little between them. Trials and exit are measured in f,
+    // so that the unit of z does not matter. r <= 1024. The fastest, by far where r is large.
+    TSS_BFGS,
+    TSS_LBFGS,  // the paper's: it begins each step anew, with −∇E
     // The exact Hessian of E in z (the curvature of f included; of C without ∇²φ), its negative
     // eigenvalues put to 0, and `shift` added to all. r <= 1024; costs r + 1 columns an iteration.
     TSS_PROJECTED_NEWTON,
@@ -471,11 +476,14 @@ typedef struct tss_reduced_def {
     const double *mass;            // of each coordinate, kg, copied; required when h > 0; NULL: 1
     const double *start;           // r numbers; NULL: 0
     double h;                      // s; 0: quasi-static. Default 0.05
-    double eps;                    // J per unit of z, >= 0; default 1e-5
-    double ftol;  // 0 <= ftol; default 2.2e-9 (L-BFGS-B's, which the paper's code uses); 0: never
-    int memory;   // pairs, 1..64; default 10
+    tss_reduced_method solver;     // default TSS_BFGS
+    // BFGS: a step ends when two directions in a row would move f by no more than tol of the size
+    // of f(start), both in ‖·‖_M (a root mean square). >= 0; default 1e-4.
+    double tol;
+    double eps;   // the others: J per unit of z, >= 0; default 1e-5
+    double ftol;  // the others: >= 0; default 2.2e-9 (L-BFGS-B's, as the paper's code); 0: never
+    int memory;   // LBFGS: pairs, 1..64; default 10
     int max_line, max_iterations;  // defaults 128, 1024
-    tss_reduced_method solver;     // default TSS_LBFGS
     double shift;  // PROJECTED_NEWTON: > 0, J per unit of z², absolute as in the paper's code (so
                    // it depends on the scale of z and of the energy); default 1e-6
     // Signed distance at x (dim numbers), m, negative inside; writes its gradient, of length 1, to
@@ -3665,13 +3673,15 @@ static int tss__n_invert(int r, double *A, double *R) {
         if (!(fabs(A[p * r + k]) > 0) || !isfinite(A[p * r + k])) return 0;
         for (int j = 0; j < r; j++) {
             double a = A[p * r + j], b = R[p * r + j];
-            A[p * r + j] = A[k * r + j], A[k * r + j] = a, R[p * r + j] = R[k * r + j], R[k * r + j] = b;
+            A[p * r + j] = A[k * r + j], A[k * r + j] = a, R[p * r + j] = R[k * r + j],
+                      R[k * r + j] = b;
         }
         double d = 1 / A[k * r + k];
         for (int j = 0; j < r; j++) A[k * r + j] *= d, R[k * r + j] *= d;
         for (int i = 0; i < r; i++) {
             double f = A[i * r + k];
-            for (int j = 0; j < r && i != k; j++) A[i * r + j] -= f * A[k * r + j], R[i * r + j] -= f * R[k * r + j];
+            for (int j = 0; j < r && i != k; j++)
+                A[i * r + j] -= f * A[k * r + j], R[i * r + j] -= f * R[k * r + j];
         }
     }
     memcpy(A, R, (size_t)(r * r) * sizeof(double));
@@ -3682,7 +3692,8 @@ static int tss__n_invert(int r, double *A, double *R) {
 
 tss_result tss_model_change_z(tss_model *m, const double *T) {
     tss_net *dec = m ? m->decoder : NULL, *enc = m ? m->encoder : NULL;
-    if (!dec || !T || dec->has_in || dec->width[0] > 4096 || (enc && (enc->map != TSS__MAP_NONE || enc->outputs != dec->width[0])))
+    if (!dec || !T || dec->has_in || dec->width[0] > 4096 ||
+        (enc && (enc->map != TSS__MAP_NONE || enc->outputs != dec->width[0])))
         return TSS_ERROR_BAD_ARGUMENT;
     int r = dec->width[0], w = dec->width[1];
     size_t rr = (size_t)(r * r), bytes = (2 * rr + (size_t)r) * sizeof(double);
@@ -3699,7 +3710,8 @@ tss_result tss_model_change_z(tss_model *m, const double *T) {
         }
     }
     double *last = enc ? enc->par + enc->theta[enc->layers - 1] : NULL;
-    for (int i = 0; ok && enc && i <= enc->width[enc->layers - 1]; i++, last += r) {  // b is the last row
+    for (int i = 0; ok && enc && i <= enc->width[enc->layers - 1];
+         i++, last += r) {  // b is the last row
         memcpy(col, last, (size_t)r * sizeof(double));
         for (int a = 0; a < r; a++) {
             last[a] = 0;
@@ -3963,7 +3975,10 @@ struct tss_reduced {
     double *phi_bar, *w, *u, *gap;
     double *tape, *slope, *mid, *bar, *next, *X, *Xbar, *panel, *scratch;
     double *S, *Y, *curve, *part, *g, *g_new, *d, *z_new;  // S, Y: memory × r
-    double *H, *V, *lambda;                                // r × r twice, r
+    double *H, *V, *lambda;  // r × r twice, r. BFGS: H is the inverse Hessian, if `known`
+    double *phi_at;          // BFGS: φ of the iterate
+    double size;             // of f(start), in ‖·‖_M
+    int known;
     double energy, scale;
     int evaluations, hessians;
     uint64_t exits[TSS_EXITS];
@@ -3972,8 +3987,8 @@ struct tss_reduced {
 tss_reduced_def tss_reduced_def_default(void) {
     tss_reduced_def d;
     memset(&d, 0, sizeof d);
-    d.h = 0.05, d.eps = 1e-5, d.ftol = 2.2e-9, d.memory = 10, d.max_line = 128,
-    d.max_iterations = 1024, d.shift = 1e-6;
+    d.h = 0.05, d.solver = TSS_BFGS, d.tol = 1e-4, d.eps = 1e-5, d.ftol = 2.2e-9, d.memory = 10;
+    d.max_line = 128, d.max_iterations = 1024, d.shift = 1e-6;
     d.cookie = TSS__REDUCED_COOKIE;
     return d;
 }
@@ -3984,14 +3999,15 @@ static const char *tss__reduced_complaint(const tss_reduced_def *d) {
     for (int i = 0; d->mass && i < d->decoder->outputs; i++)
         if (!(d->mass[i] >= 0 && d->mass[i] < 1e300))
             return "reduced solver: a mass is negative or not finite";
-    if (!(d->eps >= 0) || !(d->ftol >= 0)) return "reduced solver: a tolerance is negative";
+    if (!(d->tol >= 0) || !(d->eps >= 0) || !(d->ftol >= 0))
+        return "reduced solver: a tolerance is negative";
     if (d->memory < 1 || d->memory > 64 || d->max_line < 1 || d->max_iterations < 0)
         return "reduced solver: memory, max_line or max_iterations out of range";
     if (d->decoder->inputs > (1 << 24)) return "reduced solver: more than 2^24 inputs";
-    if (d->solver != TSS_LBFGS && d->solver != TSS_PROJECTED_NEWTON)
+    if (d->solver != TSS_LBFGS && d->solver != TSS_PROJECTED_NEWTON && d->solver != TSS_BFGS)
         return "reduced solver: unknown solver";
-    if (d->solver == TSS_PROJECTED_NEWTON && d->decoder->inputs > TSS__REDUCED_DENSE)
-        return "reduced solver: projected Newton takes at most 1024 inputs";
+    if (d->solver != TSS_LBFGS && d->decoder->inputs > TSS__REDUCED_DENSE)
+        return "reduced solver: BFGS and projected Newton take at most 1024 inputs, L-BFGS more";
     if (!(d->shift > 0 && d->shift < 1e300)) return "reduced solver: shift must be > 0";
     return NULL;
 }
@@ -4074,10 +4090,11 @@ static void tss__reduced_carve(tss_reduced *s, tss__n_slab *b) {
     double **of_r[] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new, &s->lambda};
     double **of_n[] = {&s->mass,      &s->force,     &s->c,        &s->x,
                        &s->held[0].x, &s->held[1].x, &s->held[2].x};
-    double **of_m[] = {&s->phi, &s->phi_last, &s->phi_bar, &s->w, &s->u, &s->gap, &s->force_phi};
+    double **of_m[] = {&s->phi, &s->phi_last, &s->phi_bar,   &s->w,
+                       &s->u,   &s->gap,      &s->force_phi, &s->phi_at};
     for (int k = 0; k < 7; k++) *of_r[k] = tss__n_take(b, 1, r);
     for (int k = 0; k < 7; k++) *of_n[k] = tss__n_take(b, 1, n);
-    for (int k = 0; k < 7; k++) *of_m[k] = tss__n_take(b, 1, m);
+    for (int k = 0; k < 8; k++) *of_m[k] = tss__n_take(b, 1, m);
     s->S = tss__n_take(b, (double)M, r), s->Y = tss__n_take(b, (double)M, r);
     s->curve = tss__n_take(b, 1, M), s->part = tss__n_take(b, 1, M);
     s->H = tss__n_take(b, (double)H, H), s->V = tss__n_take(b, (double)H, H);
@@ -4184,6 +4201,17 @@ static void tss__reduced_fill(tss_reduced *s) {
     memcpy(s->G_free, s->G, s->m * s->m * sizeof(double));
 }
 
+// Σ m |x_i − mean|²: the squared size of x in ‖·‖_M.
+static double tss__reduced_size(const tss_reduced *s, const double *x) {
+    double all = 0;
+    for (size_t a = 0, d = (size_t)s->dim; a < d; a++) {
+        double mean = 0;
+        for (size_t i = a; i < s->n; i += d) mean += x[i] / s->nodes;
+        for (size_t i = a; i < s->n; i += d) all += s->mass[i] * (x[i] - mean) * (x[i] - mean);
+    }
+    return all;
+}
+
 // elements NULL: for projection alone.
 static tss_result tss__reduced_make(const tss_host *host, const tss_reduced_def *def, int dim,
                                     tss_reduced **out) {
@@ -4209,6 +4237,8 @@ static tss_result tss__reduced_make(const tss_host *host, const tss_reduced_def 
         return tss__n_refuse(host, TSS_ERROR_BAD_ARGUMENT,
                              "reduced solver: start or f(start) is not finite");
     }
+    s->size = sqrt(tss__reduced_size(s, tss_reduced_x(s)));
+    if (!(s->size > 0)) s->size = 1;
     *out = s;
     return TSS_OK;
 }
@@ -4358,11 +4388,12 @@ static double tss__reduced_bodies(tss_reduced *s, const double *phi, int k) {
     return E;
 }
 
-// E at z, its gradient to g and its Hessian to H (NULL: not wanted).
-static double tss__reduced_energy(tss_reduced *s, const double *z, double *g, double *H) {
+// E where tss__reduced_forward has just been, whose result is phi; its gradient to g and, if it was
+// asked for derivatives, its Hessian to H (else NULL).
+static double tss__reduced_energy_there(tss_reduced *s, const double *phi, double *g, double *H) {
     int k = H ? s->r : 0;
     size_t m = s->m;
-    double *phi = tss__reduced_forward(s, z, k), E = s->offset;
+    double E = s->offset;
     if (H)
         s->hessians++;
     else
@@ -4385,6 +4416,11 @@ static double tss__reduced_energy(tss_reduced *s, const double *z, double *g, do
     if (!s->fit) E += tss__reduced_bodies(s, phi, k);
     tss__reduced_backward(s, k, g, H);
     return E;
+}
+
+// E at z, its gradient to g and its Hessian to H (NULL: not wanted).
+static double tss__reduced_energy(tss_reduced *s, const double *z, double *g, double *H) {
+    return tss__reduced_energy_there(s, tss__reduced_forward(s, z, H ? s->r : 0), g, H);
 }
 
 // ---- state ----------------------------------------------------------------------------------
@@ -4417,6 +4453,7 @@ tss_result tss_reduced_set(tss_reduced *s, const double *z) {
     memcpy(s->z_last, s->z, (size_t)s->r * sizeof(double));
     tss__reduced_advance(s);
     tss__reduced_advance(s);
+    s->known = 0;
     return TSS_OK;
 }
 
@@ -4641,19 +4678,28 @@ static void tss__reduced_learn(tss_reduced *s) {
     s->curve[at] = sy, s->newest = at, s->pairs++;
 }
 
-// Backtracking (c1 = 1e-4, factor 0.8, as the paper's code) along d. 1: z_new, g_new, *E are
-// better. Where E itself is rounding, the slope decides (Hager and Zhang's approximate condition,
-// the same on a parabola).
+// Whether z_new = z + t d is: c1 = 1e-4. Where E itself is rounding, the slope decides (Hager and
+// Zhang's approximate condition, the same on a parabola).
+static int tss__reduced_better(const tss_reduced *s, double t, double slope, double E) {
+    if (!isfinite(E)) return 0;
+    return E <= s->energy + 1e-4 * t * slope ||
+           (E <= s->energy + 1e-13 * fabs(s->energy) &&
+            fabs(tss__dot_n(s->r, s->g_new, s->d)) <= -(1 - 2e-4) * slope);
+}
+
+static void tss__reduced_take(tss_reduced *s, double E) {
+    size_t wide = (size_t)s->r * sizeof(double);
+    memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
+    s->energy = E;
+}
+
+// Backtracking along d by 0.8, as the paper's code. 1: z_new, g_new, *E are better.
 static int tss__reduced_line(tss_reduced *s, double slope, double *E) {
     double t = 1;
     for (int k = 0; k < s->def.max_line; k++, t *= 0.8) {
         for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
         *E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
-        if (!isfinite(*E)) continue;
-        if (*E <= s->energy + 1e-4 * t * slope) return 1;
-        if (*E <= s->energy + 1e-13 * fabs(s->energy) &&
-            fabs(tss__dot_n(s->r, s->g_new, s->d)) <= -(1 - 2e-4) * slope)
-            return 1;
+        if (tss__reduced_better(s, t, slope, *E)) return 1;
     }
     return 0;
 }
@@ -4665,7 +4711,6 @@ static double tss__n_largest(const double *g, int r) {
 }
 
 static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
-    size_t wide = (size_t)s->r * sizeof(double);
     s->pairs = 0, s->newest = 0;
     for (*iterations = 0;; ++*iterations) {
         double E, eps = s->fit ? 0 : s->def.eps;
@@ -4677,12 +4722,140 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
         if (!tss__reduced_line(s, slope, &E)) return TSS_EXIT_LINE_SEARCH;
         double fall = s->energy - E;
         tss__reduced_learn(s);
-        memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide);
-        s->energy = E;
+        tss__reduced_take(s, E);
         if (tss__n_largest(s->g, s->r) <= eps) continue;  // counted as converged
         if (!s->fit && s->def.ftol > 0 && fall < s->def.ftol * fabs(E)) {
             ++*iterations;  // this one
             return TSS_EXIT_SADDLE;
+        }
+    }
+}
+
+// ---- BFGS -----------------------------------------------------------------------------------
+
+// Of the body's size: a move that is large enough to tell a curvature from rounding, and small
+// enough to be of the same place; and the longest while no curvature is known.
+#define TSS__BFGS_PROBE 1e-6
+#define TSS__BFGS_ROUNDING 1e-9  // a shorter move tells nothing
+#define TSS__BFGS_LONGEST 1e-2
+
+// H from the pair z → z_new (Nocedal and Wright, Eq. 6.17); the first one gives it its size (Eq.
+// 6.20). 0: its curvature is not safely positive, H stays.
+static int tss__bfgs_learn(tss_reduced *s) {
+    int r = s->r;
+    double *S = s->S, *Y = s->Y, *H = s->H, *u = s->V;
+    for (int i = 0; i < r; i++) S[i] = s->z_new[i] - s->z[i], Y[i] = s->g_new[i] - s->g[i];
+    double sy = tss__dot_n(r, S, Y), ss = tss__dot_n(r, S, S), yy = tss__dot_n(r, Y, Y);
+    if (!(sy > 1e-12 * sqrt(ss) * sqrt(yy)) || !isfinite(yy)) return 0;
+    if (!s->known) {
+        tss__n_identity(H, r);
+        for (int i = 0; i < r; i++) H[i * (r + 1)] = sy / yy;
+    }
+    for (int i = 0; i < r; i++) u[i] = tss__dot_n(r, H + i * r, Y);
+    double f = (1 + tss__dot_n(r, u, Y) / sy) / sy;
+    for (int i = 0; i < r; i++)
+        for (int j = 0; j < r; j++)
+            H[i * r + j] += f * S[i] * S[j] - (S[i] * u[j] + u[i] * S[j]) / sy;
+    return s->known = 1;
+}
+
+// d = −H g, or −g where H is not known. Returns its slope, negative unless there is none.
+static double tss__bfgs_direction(tss_reduced *s) {
+    int r = s->r;
+    for (int i = 0; s->known && i < r; i++) s->d[i] = -tss__dot_n(r, s->H + i * r, s->g);
+    double slope = tss__dot_n(r, s->g, s->d);
+    if (s->known && slope < 0) return slope;
+    s->known = 0;
+    for (int i = 0; i < r; i++) s->d[i] = -s->g[i];
+    return -tss__dot_n(r, s->g, s->g);
+}
+
+// ‖φ‖ in the quadratic form of ‖·‖_M, over the size of the body.
+static double tss__bfgs_length(const tss_reduced *s, const double *phi) {
+    double square = 0;
+    for (size_t a = 0; a < s->m; a++)
+        square += phi[a] * tss__n_dot8(s->m, s->G_free + a * s->m, phi);
+    return square > 0 ? sqrt(square) / s->size : 0;
+}
+
+// The t for which t d moves the body by `wanted`, to first order.
+static double tss__bfgs_reach(tss_reduced *s, double wanted) {
+    const double *along = tss__reduced_forward(s, s->z, s->r) + s->m;
+    tss__n_zero(s->gap, s->m);
+    tss__n_combine(s->m, (size_t)s->r, s->d, along, s->gap);
+    double length = tss__bfgs_length(s, s->gap);
+    return length > 0 ? wanted / length : 1;
+}
+
+// φ of z_new = z + t d, and to *move by how much of its size that moves the body.
+static const double *tss__bfgs_go(tss_reduced *s, double t, double *move) {
+    for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
+    const double *phi = tss__reduced_forward(s, s->z_new, 0);
+    for (size_t a = 0; a < s->m; a++) s->gap[a] = phi[a] - s->phi_at[a];
+    *move = tss__bfgs_length(s, s->gap);
+    return phi;
+}
+
+// The t in [0.1 t, 0.8 t] where the cubic is least that has E0 and slope0 at 0, E and slope at t
+// (Nocedal and Wright, Eq. 3.59).
+static double tss__bfgs_shorter(double t, double E0, double slope0, double E, double slope) {
+    double a = slope0 + slope - 3 * (E - E0) / t, b = a * a - slope0 * slope, best = 0.5 * t;
+    if (isfinite(E) && b >= 0 && slope > 0)
+        best = t - t * (slope + sqrt(b) - a) / (slope - slope0 + 2 * sqrt(b));
+    else if (isfinite(E))
+        best = -0.5 * slope0 * t * t / (E - E0 - slope0 * t);
+    return best > 0.1 * t ? (best < 0.8 * t ? best : 0.8 * t) : 0.1 * t;
+}
+
+// φ of the last evaluation is that of the iterate.
+static void tss__bfgs_mark(tss_reduced *s) {
+    memcpy(s->phi_at, tss__reduced_layer(s, s->tape, s->top), s->m * sizeof(double));
+}
+
+// One iteration along d, which would move the body by `move`, φ there in phi. As long as no
+// curvature is known a trial moves it by `reach`, and the first of a step at least by a probe. 1: z
+// is better, or H at least knows more; 0: neither.
+static int tss__bfgs_iterate(tss_reduced *s, const double *phi, double slope, double move,
+                             int first, double *reach) {
+    int probe = !s->known || (first && move < TSS__BFGS_PROBE && move > 0);
+    double t = probe ? tss__bfgs_reach(s, s->known ? TSS__BFGS_PROBE : *reach) : 1;
+    for (int k = 0; k < s->def.max_line; k++) {
+        if (probe || k) phi = tss__bfgs_go(s, t, &move);
+        double E = tss__reduced_energy_there(s, phi, s->g_new, NULL);
+        if (tss__reduced_better(s, t, slope, E)) {
+            if (move >= TSS__BFGS_ROUNDING) (void)tss__bfgs_learn(s);
+            if (!s->known && *reach < TSS__BFGS_LONGEST) *reach *= 10;
+            tss__reduced_take(s, E), tss__bfgs_mark(s);
+            return 1;
+        }
+        if (probe && k == 0 && isfinite(E) && tss__bfgs_learn(s)) return 1;
+        t = tss__bfgs_shorter(t, s->energy, slope, E, tss__dot_n(s->r, s->g_new, s->d));
+    }
+    return 0;
+}
+
+// What H says of a place where it has not been can be wrong (where a contact has opened it is as
+// stiff as before), so one small move does not end a step: it is made, H learns from it, and if the
+// next is small too that ends the step.
+static tss_exit tss__bfgs_minimise(tss_reduced *s, int *iterations) {
+    double reach = TSS__BFGS_PROBE, move;
+    int quiet = 0, again = 1;
+    for (*iterations = 0;; ++*iterations) {
+        if (tss__n_largest(s->g, s->r) == 0) return TSS_EXIT_CONVERGED;
+        if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
+        double slope = tss__bfgs_direction(s);
+        if (!(slope < 0)) return TSS_EXIT_LINE_SEARCH;
+        const double *phi = tss__bfgs_go(s, 1, &move);
+        int still = s->known && move <= s->def.tol;
+        if (still && quiet) return TSS_EXIT_CONVERGED;
+        if (tss__bfgs_iterate(s, phi, slope, move, *iterations == 0, &reach)) {
+            quiet = still;
+        } else if (still) {
+            return TSS_EXIT_CONVERGED;
+        } else if (again && s->known) {
+            again = s->known = 0;
+        } else {
+            return TSS_EXIT_LINE_SEARCH;
         }
     }
 }
@@ -4692,7 +4865,10 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
 static tss_reduced_info tss__reduced_solve(tss_reduced *s) {
     tss_reduced_info info;
     memset(&info, 0, sizeof info);
-    info.exit = tss__reduced_minimise(s, &info.iterations);
+    if (s->def.solver == TSS_BFGS && !s->fit)
+        info.exit = tss__bfgs_minimise(s, &info.iterations);
+    else
+        info.exit = tss__reduced_minimise(s, &info.iterations);
     info.energy = s->energy, info.gradient = tss__n_largest(s->g, s->r);
     info.evaluations = s->evaluations, info.hessians = s->hessians;
     return info;
@@ -4705,24 +4881,14 @@ tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
     for (int i = 0; i < s->r; i++) s->z_new[i] = 2 * s->z[i] - s->z_last[i];
     memcpy(s->z_last, s->z, wide);
     s->energy = tss__reduced_energy(s, s->z, s->g, NULL);
+    tss__bfgs_mark(s);
     double E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
-    if (E < s->energy) memcpy(s->z, s->z_new, wide), memcpy(s->g, s->g_new, wide), s->energy = E;
+    if (E < s->energy) tss__reduced_take(s, E), tss__bfgs_mark(s);
     tss_reduced_info info = tss__reduced_solve(s);
     tss__reduced_advance(s);
     s->exits[info.exit]++;
     if (out) *out = info;
     return TSS_OK;
-}
-
-// Σ m |x_i − mean|²: the squared size of x in ‖·‖_M.
-static double tss__reduced_size(const tss_reduced *s, const double *x) {
-    double all = 0;
-    for (size_t a = 0, d = (size_t)s->dim; a < d; a++) {
-        double mean = 0;
-        for (size_t i = a; i < s->n; i += d) mean += x[i] / s->nodes;
-        for (size_t i = a; i < s->n; i += d) all += s->mass[i] * (x[i] - mean) * (x[i] - mean);
-    }
-    return all;
 }
 
 tss_result tss_reduced_project(tss_reduced *s, const double *x, tss_reduced_info *out) {

@@ -37,6 +37,7 @@ static void run(const tss_net *net, const tss_elements *e, tss_reduced_method me
     double t = cpu_ms(), created, stepping = 0, decoding = 0;
     int iterations = 0, evaluations = 0, steps = 0;
     d.decoder = net, d.elements = e, d.mass = mass, d.solver = method, d.eps = 1e-6, d.ftol = 0;
+    d.tol = 1e-6;
     if (tss_reduced_create(NULL, &d, &s) != TSS_OK) return;
     created = cpu_ms() - t;
     for (; steps < 100 && stepping < 5000; steps++) {
@@ -48,9 +49,12 @@ static void run(const tss_net *net, const tss_elements *e, tss_reduced_method me
         t = cpu_ms(), (void)tss_reduced_x(s), decoding += cpu_ms() - t;
         iterations += info.iterations, evaluations += info.evaluations;
     }
-    printf("%s,%s,%d,%.2f,%.2f,%.3f,%.3f,%.1f\n", name,
-           method == TSS_LBFGS ? "L-BFGS" : "projected Newton", steps, 1.0 * iterations / steps,
-           1.0 * evaluations / steps, stepping / iterations, decoding / steps, created);
+    printf("%s,%s,%d,%.2f,%.2f,%.3f,%.3f,%.3f,%.1f\n", name,
+           method == TSS_LBFGS  ? "L-BFGS"
+           : method == TSS_BFGS ? "BFGS"
+                                : "projected Newton",
+           steps, 1.0 * iterations / steps, 1.0 * evaluations / steps, stepping / steps,
+           stepping / iterations, decoding / steps, created);
     tss_reduced_destroy(s);
 }
 
@@ -68,7 +72,7 @@ int main(void) {
     if (tss_elements_create(NULL, &ed, &all) != TSS_OK) return 1;
     ed.subset = subset, ed.count = FEW, ed.weight = weight;
     if (tss_elements_create(NULL, &ed, &few) != TSS_OK) return 1;
-    printf("scene,solver,steps,iterations,evaluations,ms_iteration,ms_decode,ms_create\n");
+    printf("scene,solver,steps,iterations,evaluations,ms_step,ms_iteration,ms_decode,ms_create\n");
     for (int kind = 0; kind < 2; kind++) {
         // Unsupervised: 8 → 64 × 4 → coordinates. Supervised: 40 → 200 × 2 → 80 columns.
         int free_[6] = {8, 64, 64, 64, 64, N}, pca[4] = {40, 200, 200, 80};
@@ -80,7 +84,7 @@ int main(void) {
         else
             nd.out_scale = 0.05;
         if (tss_net_create(NULL, &nd, &net) != TSS_OK) return 1;
-        for (int m = 0; m < 2; m++) {
+        for (int m = 0; m < 3; m++) {
             run(net, all, (tss_reduced_method)m, kind ? "r 40 all" : "r 8 all");
             run(net, few, (tss_reduced_method)m, kind ? "r 40 cubature" : "r 8 cubature");
         }

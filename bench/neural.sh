@@ -5,10 +5,11 @@
 # OUT (bench/results). A part whose rows are in its CSV already is not run again, and training goes on
 # where it stopped: call it until it ends with 0 (3: MINUTES are over; 1: something failed). For the large
 # systems, whose steps take seconds: -t: of each test sequence only the first STEPS; -F: full space is what
-# the frames have, not timed once more; -c: CELLS of part runtime (0, all, and those of the scene's training).
+# the frames have, not timed once more; -c: CELLS of part runtime (0, all, and those of the scene's training) and bfgs (0).
 #   part     file                  system (unless -s)    paper B
 #   methods  neural.csv            all small; also -s twist_bar, cloth, dinosaur, elephant, bunny   Table 1: vanilla, lipschitz, linear, full
 #            neural_errors.csv     as neural.csv         deciles of the errors (also by the part errors, from trained models)
+#   bfgs     neural_bfgs.csv       as neural.csv         none: the default solver, TSS_BFGS; all other parts take the paper's L-BFGS
 #   newton   neural_newton.csv     all small             Table 4: projected Newton
 #   eps      neural_eps.csv        twist, pulled, bist.  Table 2: eps 1e-4, 1e-5, 1e-6
 #   order    neural_order.csv      twist, pulled         Table 3: L_LS of order 0, 1, 2
@@ -36,7 +37,7 @@ while [ $# -gt 0 ]; do
     esac
 done
 work=${work:-$build/neural_bench}; out=${1:-bench/results}; [ $# -eq 0 ] || shift
-parts=${*:-methods newton eps order runtime cubature cost r bridge}
+parts=${*:-methods bfgs newton eps order runtime cubature cost r bridge}
 seeds=${seeds:-0 1 2}
 export OMP_NUM_THREADS=1
 mkdir -p "$out" "$work" || exit 1
@@ -81,7 +82,7 @@ tss() {
     time=; [ "$action" != train ] || time="--minutes $(left)" || exit 3
     # shellcheck disable=SC2086
     "$build/tss" neural "$action" "examples/scenes/neural_$system.json" -o "$dir" --seed "$seed" --threads 1 --name "$system" \
-        $time "$@" >>"$dir/log" 2>&1
+        --set neural.solver.kind=lbfgs $time "$@" >>"$dir/log" 2>&1
     code=$?
     [ $code != 3 ] || exit 3
     [ $code = 0 ] || { echo "neural: $system $seed: $action: $(tail -n 1 "$dir/log")"; bad=1; return 1; }
@@ -134,6 +135,14 @@ errors() {
 newton() {
     there neural_newton.csv system="$1" seed="$2" && return
     train "$1" "$2" && rows evaluate neural_newton.csv "$1" "$work/$1" "$2" --set neural.solver.kind=newton
+}
+
+bfgs() {
+    for c in ${cells:-0}; do
+        [ "$c" = 0 ] && there neural_bfgs.csv system="$1" seed="$2" && continue
+        there neural_bfgs.csv system="$1" seed="$2" runtime_cells="$c" && continue
+        train "$1" "$2" && rows evaluate neural_bfgs.csv "$1" "$work/$1" "$2" --set neural.solver.kind=bfgs --set "neural.solver.cubature=$c"
+    done
 }
 
 eps() {
@@ -212,12 +221,12 @@ bridge() {
 
 for part in $parts; do
     case $part in
-    methods | newton | errors) these=${systems:-twist_bar_small pulled_bar bistable dinosaur_small} ;;
+    methods | bfgs | newton | errors) these=${systems:-twist_bar_small pulled_bar bistable dinosaur_small} ;;
     eps) these=${systems:-twist_bar_small pulled_bar bistable} ;;
     order | runtime | cubature | cost) these=${systems:-twist_bar_small pulled_bar} ;;
     r) these=${systems:-pulled_bar} ;;
     bridge) these=${systems:-twist_bar_small pulled_bar dinosaur_small} ;;
-    *) echo "$part: no such part (methods errors newton eps order runtime cubature cost r bridge)" >&2; exit 2 ;;
+    *) echo "$part: no such part (methods bfgs errors newton eps order runtime cubature cost r bridge)" >&2; exit 2 ;;
     esac
     for n in $seeds; do for s in $these; do $part "$s" "$n"; done; done
 done

@@ -841,6 +841,10 @@ static void page_neural(source *s, report *r) {
         {"simulation error", SIMULATION, 0}};
     neural_methods(s, r);
     neural_distributions(s, r);
+    neural_section(s, r, "BFGS that remembers",
+                   "The same decoders and tests by the library's default solver, whose inverse Hessian stays from step to step; "
+                   "everything else on this page is by the paper's L-BFGS, which begins each step anew, or by projected Newton.",
+                   "neural_bfgs.csv", CELLS, "cells at run time", newton, 4);
     neural_section(s, r, "Projected Newton (Table 4)", "The same decoders, each step by projected Newton.",
                    "neural_newton.csv", -1, NULL, newton, 4);
     neural_section(s, r, "When to stop (Table 2)",

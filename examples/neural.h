@@ -1025,8 +1025,8 @@ static tss_reduced_def neural_solver(neural *v, const tss_net *decoder, const ts
         rd.sdf = tss_sdf_ball, rd.sdf_user = &v->ball, rd.contact_stiffness = v->ball_stiffness;
         rd.contact_margin = v->ball_margin, rd.contact_weight = v->area;
     }
-    rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
-    rd.max_iterations = d->solver.max_iterations, rd.solver = d->solver.kind ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+    rd.tol = d->solver.tol, rd.eps = d->solver.eps, rd.ftol = d->solver.ftol, rd.memory = d->solver.memory, rd.max_line = d->solver.max_line;
+    rd.max_iterations = d->solver.max_iterations, rd.solver = (tss_reduced_method)d->solver.kind;
     return rd;
 }
 

@@ -136,8 +136,9 @@
                            harmonic mean of the trained decoder's, supervised (false), unit: J,
                            the whitened Hessian in the z that the phase ends with (1), cubature: cells,
                            0: all (0), samples: that choose them (64)}
-    .solver                of a step: {kind: lbfgs | newton (lbfgs), eps (1e-5), ftol (2.2e-9), memory
-                           (10), max_line (128), max_iterations (1024), cubature: cells at run time, 0: all (0),
+    .solver                of a step: {kind: bfgs | lbfgs | newton (bfgs), tol: of bfgs (1e-4), of the
+                           others eps (1e-5), ftol (2.2e-9), memory (10), max_line (128), max_iterations
+                           (1024), cubature: cells at run time, 0: all (0),
                            stretch: evaluate steps vanilla and linear in z times this (1)}
     .samples               of Eq. 7 (256)
 
@@ -277,7 +278,7 @@ typedef struct scene_neural {
     } lipschitz;
     struct {
         int kind, memory, max_line, max_iterations, cubature;
-        double eps, ftol, stretch;
+        double tol, eps, ftol, stretch;
     } solver;
 } scene_neural;
 
@@ -1727,7 +1728,8 @@ static const char *const scene__whiten_states[] = {"frames", "solver", NULL};
 static const char *const scene__net_starts[] = {"random", "linear", NULL};
 static const char *const scene__activations[] = {"elu", "silu", "softplus", "gelu", NULL};
 static const char *const scene__estimators[] = {"exact", "uv", "u", NULL};
-static const char *const scene__reduced_solvers[] = {"lbfgs", "newton", NULL};
+// In the order of tss_reduced_method.
+static const char *const scene__reduced_solvers[] = {"bfgs", "lbfgs", "newton", NULL};
 
 typedef struct scene__handle_item {
     scene__region where;
@@ -1892,6 +1894,7 @@ static const scene__key scene__lipschitz_keys[] = {
     SCENE__END};
 static const scene__key scene__reduced_keys[] = {
     SCENE__ONE(scene_neural, solver.kind, "kind", scene__reduced_solvers),
+    SCENE__NUM(scene_neural, solver.tol, "tol", 0, 1),
     SCENE__NUM(scene_neural, solver.eps, "eps", 0, 1e300),
     SCENE__NUM(scene_neural, solver.ftol, "ftol", 0, 1),
     SCENE__INT(scene_neural, solver.memory, "memory", 1, 64),
@@ -1947,8 +1950,8 @@ static void scene__neural_defaults(scene_neural *n) {
     n->lipschitz.rate_end = 1e-6, n->lipschitz.weight = 1e-3, n->lipschitz.order = 2;
     n->lipschitz.estimator = 2, n->lipschitz.probes = 1, n->lipschitz.through_encoder = 1;
     n->lipschitz.samples = 64, n->lipschitz.handles = 1, n->lipschitz.unit = 1;
-    n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9, n->solver.stretch = 1, n->solver.memory = 10;
-    n->solver.max_line = 128, n->solver.max_iterations = 1024;
+    n->solver.tol = 1e-4, n->solver.eps = 1e-5, n->solver.ftol = 2.2e-9;
+    n->solver.stretch = 1, n->solver.memory = 10, n->solver.max_line = 128, n->solver.max_iterations = 1024;
 }
 
 static int scene__read_neural(scene__reader *r, const cJSON *v) {

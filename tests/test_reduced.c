@@ -355,7 +355,18 @@ static void test_eigen(void **state) {
     }
 }
 
-// The same minima as L-BFGS, in fewer iterations; a saddle as the start is left.
+// Where P is least; from there on the nonlinear decoders here have one minimum a step.
+static void rest_of(const scene *s, const tss_net *n, int r, double *z) {
+    tss_reduced_def d = tss_reduced_def_default();
+    tss_reduced *sim;
+    d.decoder = n, d.elements = s->e, d.h = 0, d.solver = TSS_PROJECTED_NEWTON;
+    assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+    assert_int_equal(tss_reduced_step(sim, NULL), TSS_OK);
+    memcpy(z, tss_reduced_z(sim), (size_t)r * sizeof *z);
+    tss_reduced_destroy(sim);
+}
+
+// The same minima by all, by projected Newton and BFGS in fewer iterations than by L-BFGS.
 static void test_newton(void **state) {
     (void)state;
     enum { R = 4 };
@@ -363,20 +374,21 @@ static void test_newton(void **state) {
         scene s;
         scene_make(&s, dim, 4, 1, 1);
         tss_net *n = decoder_of(&s, R, TSS_SILU, NARROW);
-        double *force = randoms((size_t)s.coords, 2), *x = doubles((size_t)s.coords);
-        int iterations[2] = {0};
-        for (int k = 0; k < 2; k++) {
+        double *force = randoms((size_t)s.coords, 2), *x = doubles((size_t)s.coords), rest[R];
+        int iterations[3] = {0};
+        rest_of(&s, n, R, rest);
+        for (int k = 0; k < 3; k++) {
             tss_reduced_def d = tss_reduced_def_default();
             tss_reduced *sim;
             d.decoder = n, d.elements = s.e, d.mass = s.mass, d.h = 0.1, d.ftol = 0, d.eps = 1e-9;
-            d.solver = k ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+            d.tol = 1e-10, d.start = rest, d.solver = (tss_reduced_method)k;
             assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
             tss_reduced_set_force(sim, force);
             for (int step = 0; step < 5; step++) {
                 tss_reduced_info info;
                 assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
                 assert_int_equal(info.exit, TSS_EXIT_CONVERGED);
-                assert_true(k ? info.hessians == info.iterations : info.hessians == 0);
+                assert_int_equal(info.hessians, k == TSS_PROJECTED_NEWTON ? info.iterations : 0);
                 iterations[k] += info.iterations;
             }
             if (k)
@@ -386,11 +398,177 @@ static void test_newton(void **state) {
             assert_true(distance(s.X, x, (size_t)s.coords) > 0.05);
             tss_reduced_destroy(sim);
         }
-        print_message("%dD, 5 steps: %d iterations of L-BFGS, %d of projected Newton\n", dim,
-                      iterations[0], iterations[1]);
-        assert_true(2 * iterations[1] < iterations[0]);
+        print_message("%dD, 5 steps: iterations: L-BFGS %d, projected Newton %d, BFGS %d\n", dim,
+                      iterations[TSS_LBFGS], iterations[TSS_PROJECTED_NEWTON],
+                      iterations[TSS_BFGS]);
+        assert_true(2 * iterations[TSS_PROJECTED_NEWTON] < iterations[TSS_LBFGS]);
+        assert_true(iterations[TSS_BFGS] < iterations[TSS_LBFGS]);
         tss_net_destroy(n), scene_free(&s), free(force), free(x);
     }
+}
+
+// ---- BFGS -----------------------------------------------------------------------------------
+
+// z times 2^e: all that this changes of a number are its exponents.
+static void stretch(tss_net *n, int r, int e) {
+    for (int i = 0; i < r * 9; i++)  // the first layer of decoder_of is r × 9
+        tss_net_parameters(n)[i] = ldexp(tss_net_parameters(n)[i], -e);
+}
+
+// In any unit of z the same states, bit by bit, by as many evaluations; of L-BFGS neither is so.
+static void test_bfgs_unit(void **state) {
+    (void)state;
+    enum { R = 4 };
+    scene s;
+    scene_make(&s, 3, 4, 1, 1);
+    double *force = randoms((size_t)s.coords, 2);
+    for (int k = 0; k < 2; k++) {
+        double x[MOST];
+        int evaluations[3] = {0}, same = 1;
+        for (int unit = 0; unit < 3; unit++) {
+            rng = tss_rng_seed(5);  // decoder_of draws from it
+            tss_net *n = decoder_of(&s, R, TSS_SILU, NARROW);
+            tss_reduced_def d = tss_reduced_def_default();
+            tss_reduced *sim;
+            stretch(n, R, 20 * (unit - 1));
+            d.decoder = n, d.elements = s.e, d.mass = s.mass, d.h = 0.1;
+            if (k) d.solver = TSS_LBFGS;
+            assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+            tss_reduced_set_force(sim, force);
+            for (int step = 0; step < 8; step++) {
+                tss_reduced_info info;
+                assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+                assert_true(k || info.exit == TSS_EXIT_CONVERGED);
+                evaluations[unit] += info.evaluations;
+            }
+            size_t bytes = (size_t)s.coords * sizeof *x;
+            if (unit)
+                same = same && memcmp(x, tss_reduced_x(sim), bytes) == 0;
+            else
+                memcpy(x, tss_reduced_x(sim), bytes);
+            tss_reduced_destroy(sim), tss_net_destroy(n);
+        }
+        print_message("z times 2^-20, 1, 2^20: %d, %d, %d evaluations of %s\n", evaluations[0],
+                      evaluations[1], evaluations[2], k ? "L-BFGS" : "BFGS");
+        int alike = evaluations[0] == evaluations[1] && evaluations[1] == evaluations[2];
+        assert_int_equal(same && alike, !k);
+        assert_true(k || distance(s.X, x, (size_t)s.coords) > 0.05);
+    }
+    scene_free(&s), free(force);
+}
+
+// ‖x − y‖_M over ‖X − its centre‖_M.
+static double moved(const scene *s, const double *x, const double *y) {
+    double gap = 0, size = 0;
+    for (int a = 0; a < s->dim; a++) {
+        double mean = 0;
+        for (int i = a; i < s->coords; i += s->dim) mean += s->X[i] / s->nodes;
+        for (int i = a; i < s->coords; i += s->dim) {
+            gap += s->mass[i] * (x[i] - y[i]) * (x[i] - y[i]);
+            size += s->mass[i] * (s->X[i] - mean) * (s->X[i] - mean);
+        }
+    }
+    return sqrt(gap / size);
+}
+
+// Each step ends as near to its minimum as tol says, which projected Newton finds from the same
+// state; less tol takes fewer evaluations. A body at rest takes few.
+static void test_bfgs_tol(void **state) {
+    (void)state;
+    enum { R = 4, STEPS = 6 };
+    scene s;
+    scene_make(&s, 3, 4, 1, 1);
+    tss_net *n = decoder_of(&s, R, TSS_SILU, NARROW);
+    double *force = randoms((size_t)s.coords, 0.2), rest[R];
+    int before = 0;
+    rest_of(&s, n, R, rest);
+    for (int k = 2; k <= 8; k += 2) {
+        tss_reduced_def d = tss_reduced_def_default(), exact = d;
+        tss_reduced *sim, *newton;
+        tss_reduced_info info;
+        int evaluations = 0;
+        double most = 0;
+        d.decoder = n, d.elements = s.e, d.mass = s.mass, d.h = 0, d.tol = pow(10, -k);
+        d.start = rest;
+        exact = d, exact.solver = TSS_PROJECTED_NEWTON, exact.eps = 1e-10, exact.ftol = 0;
+        assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+        assert_int_equal(tss_reduced_create(NULL, &exact, &newton), TSS_OK);
+        for (int step = 0; step < STEPS; step++) {
+            double f[MOST];
+            for (int i = 0; i < s.coords; i++) f[i] = (1 + 0.2 * step) * force[i];
+            tss_reduced_set_force(sim, f), tss_reduced_set_force(newton, f);
+            assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+            assert_int_equal(info.exit, TSS_EXIT_CONVERGED);
+            evaluations += step ? info.evaluations : 0;  // the first has everything to learn
+            assert_int_equal(tss_reduced_step(newton, &info), TSS_OK);
+            most = fmax(most, moved(&s, tss_reduced_x(sim), tss_reduced_x(newton)));
+        }
+        print_message("tol %g: %d evaluations in %d steps, at most %.1e from the minimum\n", d.tol,
+                      evaluations, STEPS - 1, most);
+        assert_true(most <= d.tol && evaluations >= before);
+        before = evaluations + (k > 2);
+        // The same forces again: nothing is left to do.
+        for (int step = 0; step < 3; step++) assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+        assert_true(info.evaluations <= 4);
+        tss_reduced_destroy(sim), tss_reduced_destroy(newton);
+    }
+    tss_net_destroy(n), scene_free(&s), free(force);
+}
+
+static tss_net *mover(const scene *s);
+
+// The floor that a block lay on is gone: the first step of its fall is g h², whatever H knew.
+static void test_bfgs_contact_opens(void **state) {
+    (void)state;
+    scene s;
+    scene_make(&s, 3, 3, 1, 1);
+    tss_net *n = mover(&s);
+    tss_halfspace ground = {3, {0, 0, 0}, {0, 1, 0}};
+    tss_reduced_def d = tss_reduced_def_default();
+    tss_reduced *sim;
+    tss_reduced_info info;
+    double force[MOST] = {0};
+    for (int i = 0; i < s.nodes; i++) force[3 * i + 1] = -9.81 * s.mass[3 * i];
+    d.decoder = n, d.elements = s.e, d.mass = s.mass, d.h = 0.01, d.sdf = tss_sdf_halfspace,
+    d.sdf_user = &ground, d.contact_stiffness = 1e7;
+    assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+    tss_reduced_set_force(sim, force);
+    for (int k = 0; k < 60; k++) assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+    double rest = tss_reduced_x(sim)[1];
+    assert_true(rest < 0 && rest > -1e-4);
+    ground.point[1] = -10;
+    assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+    double fall = rest - tss_reduced_x(sim)[1], g_h2 = 9.81 * d.h * d.h;
+    print_message("contact opens: falls %.4g, g h² is %.4g, %d evaluations\n", fall, g_h2,
+                  info.evaluations);
+    assert_true(fabs(fall - g_h2) < 0.05 * g_h2);
+    tss_reduced_destroy(sim), tss_net_destroy(n), scene_free(&s);
+}
+
+// What H knows is forgotten where the state is set: from there the same bits as a new solver's.
+static void test_bfgs_set(void **state) {
+    (void)state;
+    enum { R = 4 };
+    scene s;
+    scene_make(&s, 2, 4, 1, 1);
+    tss_net *n = decoder_of(&s, R, TSS_SILU, NARROW);
+    double *force = randoms((size_t)s.coords, 2), z[3][R];
+    tss_reduced_def d = tss_reduced_def_default();
+    tss_reduced *sim;
+    const double zero[R] = {0};
+    d.decoder = n, d.elements = s.e, d.mass = s.mass;
+    assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+    tss_reduced_set_force(sim, force);
+    for (int run = 0; run < 3; run++) {
+        if (run == 2) assert_int_equal(tss_reduced_project(sim, s.X, NULL), TSS_OK);
+        if (run) assert_int_equal(tss_reduced_set(sim, zero), TSS_OK);
+        for (int k = 0; k < 5; k++) assert_int_equal(tss_reduced_step(sim, NULL), TSS_OK);
+        memcpy(z[run], tss_reduced_z(sim), sizeof z[run]);
+    }
+    assert_true(norm(z[0], R) > 0);
+    assert_memory_equal(z[0], z[1], sizeof z[0]);
+    assert_memory_equal(z[0], z[2], sizeof z[0]);
+    tss_reduced_destroy(sim), tss_net_destroy(n), scene_free(&s), free(force);
 }
 
 // ---- contact --------------------------------------------------------------------------------
@@ -414,7 +592,7 @@ static tss_net *mover(const scene *s) {
 static void test_contact_rest(void **state) {
     (void)state;
     for (int dim = 2; dim <= 3; dim++)
-        for (int solver = 0; solver < 2; solver++) {
+        for (int solver = 0; solver < 3; solver++) {
             scene s;
             scene_make(&s, dim, 3, 1, 1);
             tss_net *n = mover(&s);
@@ -426,10 +604,10 @@ static void test_contact_rest(void **state) {
                 area[i] = 0.1 + 0.05 * (i % 3), all += s.X[i * dim + 1] == 0 ? area[i] : 0;
                 force[i * dim + 1] = -9.81 * s.mass[i * dim], weight += 9.81 * s.mass[i * dim];
             }
-            d.decoder = n, d.elements = s.e, d.h = 0, d.ftol = 0, d.eps = 1e-8;
+            d.decoder = n, d.elements = s.e, d.h = 0, d.ftol = 0, d.eps = 1e-8, d.tol = 1e-10;
             d.sdf = tss_sdf_halfspace, d.sdf_user = &ground, d.contact_stiffness = 2000;
             d.contact_margin = 0.03, d.contact_weight = area;
-            d.solver = solver ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+            d.solver = (tss_reduced_method)solver;
             assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
             tss_reduced_set_force(sim, force);
             for (int k = 0; k < 2; k++) {
@@ -552,7 +730,7 @@ static void test_memory(void **state) {
     enum { R = 3 };
     tss_host h = tss_host_default();
     h.alloc = stingy_alloc, h.free = stingy_free, h.log = keep_log, h.workers = 1;
-    for (int solver = 0; solver < 2; solver++)
+    for (int solver = 0; solver < 3; solver++)
         for (int cubature = 0; cubature < 2; cubature++) {
             scene s;
             scene_make(&s, 3, 3, 1, 1);
@@ -562,7 +740,7 @@ static void test_memory(void **state) {
             tss_reduced_def d = tss_reduced_def_default();
             tss_reduced *sim = NULL;
             d.decoder = n, d.elements = cubature ? few : s.e, d.mass = s.mass;
-            d.solver = solver ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+            d.solver = (tss_reduced_method)solver;
             d.sdf = tss_sdf_ball, d.sdf_user = &ball, d.contact_stiffness = 50;
             int limit = 0;
             for (allowance = 0; tss_reduced_create(&h, &d, &sim) == TSS_ERROR_NO_MEMORY;
@@ -620,6 +798,8 @@ static void test_refusals(void **state) {
     REFUSED(d.mass = NULL, "masses");
     REFUSED(d.mass = minus, "mass is");
     REFUSED(d.shift = 0, "shift");
+    REFUSED(d.tol = -1, "tolerance");
+    REFUSED(d.tol = NAN, "tolerance");
     REFUSED(d.solver = (tss_reduced_method)7, "solver");
     REFUSED(d.contact_stiffness = -1, "contact_stiffness");
     REFUSED(d.contact_margin = NAN, "contact_margin");
@@ -694,13 +874,13 @@ static void test_nan(void **state) {
     scene s;
     scene_make(&s, 2, 3, 1, 1);
     tss_net *n = decoder_of(&s, 3, TSS_SILU, NARROW);
-    for (int solver = 0; solver < 2; solver++) {
+    for (int solver = 0; solver < 3; solver++) {
         tss_reduced_def d = tss_reduced_def_default();
         tss_reduced *sim;
         tss_reduced_info info;
         d.decoder = n, d.elements = s.e, d.mass = s.mass, d.sdf = no_answer,
         d.contact_stiffness = 1;
-        d.solver = solver ? TSS_PROJECTED_NEWTON : TSS_LBFGS;
+        d.solver = (tss_reduced_method)solver;
         assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
         assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
         assert_int_equal(info.exit, TSS_EXIT_LINE_SEARCH);
@@ -798,7 +978,7 @@ static void test_basis_order(void **state) {
             for (int i = 0; i < b.s.coords; i++) force[i] = i % dim == 1 ? b.mass[i] * gravity : 0;
             tss_reduced_def d = tss_reduced_def_default();
             tss_reduced *sim;
-            d.decoder = b.n, d.elements = b.s.e, d.mass = b.mass, d.eps = 1e-12, d.ftol = 0;
+            d.decoder = b.n, d.elements = b.s.e, d.mass = b.mass, d.tol = 1e-9;
             assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
             tss_reduced_set_force(sim, force);
             tss_step_info info;
@@ -948,6 +1128,10 @@ int main(void) {
         T(test_lanes),
         T(test_eigen),
         T(test_newton),
+        T(test_bfgs_unit),
+        T(test_bfgs_tol),
+        T(test_bfgs_contact_opens),
+        T(test_bfgs_set),
         T(test_contact_rest),
         T(test_sdf),
         T(test_project),
