@@ -460,8 +460,8 @@ typedef enum tss_exit {    // the paper's four (§5)
 
 typedef enum tss_reduced_method {
     // Quasi-Newton with an inverse Hessian that stays from step to step (until tss_reduced_set or
-    // _project), since E's Hessian changes little between them. Trials and exit are measured in f,
-    // so that the unit of z does not matter. r <= 1024. The fastest, by far where r is large.
+    // _project, after which the first step takes the exact one), since E's Hessian changes little
+    // between them. Its exit is measured in f, so that the unit of z does not matter. r <= 1024.
     TSS_BFGS,
     TSS_LBFGS,  // the paper's: it begins each step anew, with −∇E
     // The exact Hessian of E in z (the curvature of f included; of C without ∇²φ), its negative
@@ -505,7 +505,7 @@ typedef struct tss_reduced_info {
     tss_exit exit;
     int iterations, evaluations;  // of E with its gradient
     double energy, gradient;      // E and ‖∇E‖∞ at the end
-    int hessians;                 // of PROJECTED_NEWTON
+    int hessians;                 // that were computed, not of LBFGS
 } tss_reduced_info;
 
 typedef struct tss_reduced tss_reduced;  // opaque; one thread at a time, tss_reduced_x included
@@ -4086,7 +4086,7 @@ static void tss__reduced_carve(tss_reduced *s, tss__n_slab *b) {
     const tss_net *net = s->def.decoder;
     size_t r = (size_t)s->r, n = s->n, m = s->m, M = (size_t)s->def.memory;
     size_t cols = 1 + (size_t)s->k_most, H = s->k_most ? r : 0, tape = net->off[s->top + 1];
-    size_t x_cols = 1 + (s->def.solver == TSS_PROJECTED_NEWTON ? r : 0);
+    size_t x_cols = 1 + (s->def.solver != TSS_LBFGS ? r : 0);
     double **of_r[] = {&s->z, &s->z_last, &s->g, &s->g_new, &s->d, &s->z_new, &s->lambda};
     double **of_n[] = {&s->mass,      &s->force,     &s->c,        &s->x,
                        &s->held[0].x, &s->held[1].x, &s->held[2].x};
@@ -4633,15 +4633,21 @@ static void tss__eigen(int r_, double *A, double *V, double *lambda) {
     for (size_t p = 0; p < r; p++) lambda[p] = A[p * r + p];
 }
 
-// d = −(H₊ + shift)⁻¹ g, H₊ without negative eigenvalues. In a fit the shift is relative.
-static void tss__reduced_newton(tss_reduced *s) {
+// The eigenvectors (rows of V) and eigenvalues of ∇²E at z; H is overwritten.
+static void tss__reduced_hessian(tss_reduced *s) {
     int r = s->r;
-    double most = 0, shift = s->def.shift;
     tss__reduced_energy(s, s->z, s->g_new, s->H);
     for (int a = 0; a < r; a++)
         for (int b = 0; b < a; b++)
             s->H[a * r + b] = s->H[b * r + a] = 0.5 * (s->H[a * r + b] + s->H[b * r + a]);
     tss__eigen(r, s->H, s->V, s->lambda);
+}
+
+// d = −(H₊ + shift)⁻¹ g, H₊ without negative eigenvalues. In a fit the shift is relative.
+static void tss__reduced_newton(tss_reduced *s) {
+    int r = s->r;
+    double most = 0, shift = s->def.shift;
+    tss__reduced_hessian(s);
     for (int a = 0; a < r; a++) most = s->lambda[a] > most ? s->lambda[a] : most;
     if (s->fit) shift = 1e-12 * most + 1e-300;
     tss__n_zero(s->d, (size_t)r);
@@ -4734,65 +4740,63 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
 // ---- BFGS -----------------------------------------------------------------------------------
 
 // Of the body's size: a move that is large enough to tell a curvature from rounding, and small
-// enough to be of the same place; and the longest while no curvature is known.
+// enough to be of the same place; and one that tells nothing.
 #define TSS__BFGS_PROBE 1e-6
-#define TSS__BFGS_ROUNDING 1e-9  // a shorter move tells nothing
-#define TSS__BFGS_LONGEST 1e-2
+#define TSS__BFGS_ROUNDING 1e-9
 
-// H from the pair z → z_new (Nocedal and Wright, Eq. 6.17); the first one gives it its size (Eq.
-// 6.20). 0: its curvature is not safely positive, H stays.
+// H begins as the inverse of |∇²E| (its eigenvalues' absolute values, none below 1e-8 of the
+// largest).
+static void tss__bfgs_begin(tss_reduced *s) {
+    int r = s->r;
+    double most = 0;
+    tss__reduced_hessian(s);
+    for (int a = 0; a < r; a++) most = fmax(most, fabs(s->lambda[a]));
+    tss__n_zero(s->H, (size_t)r * (size_t)r);
+    for (int a = 0; a < r; a++) {
+        const double *v = s->V + a * r;
+        double l = fmax(fabs(s->lambda[a]), most > 0 ? 1e-8 * most : 1);
+        for (int i = 0; i < r; i++) tss__n_axpy((size_t)r, v[i] / l, v, s->H + i * r);
+    }
+    s->known = 1;
+}
+
+// H from the pair z → z_new (Nocedal and Wright, Eq. 6.17). 0: its curvature is not safely
+// positive, H stays.
 static int tss__bfgs_learn(tss_reduced *s) {
     int r = s->r;
     double *S = s->S, *Y = s->Y, *H = s->H, *u = s->V;
     for (int i = 0; i < r; i++) S[i] = s->z_new[i] - s->z[i], Y[i] = s->g_new[i] - s->g[i];
     double sy = tss__dot_n(r, S, Y), ss = tss__dot_n(r, S, S), yy = tss__dot_n(r, Y, Y);
     if (!(sy > 1e-12 * sqrt(ss) * sqrt(yy)) || !isfinite(yy)) return 0;
-    if (!s->known) {
-        tss__n_identity(H, r);
-        for (int i = 0; i < r; i++) H[i * (r + 1)] = sy / yy;
-    }
     for (int i = 0; i < r; i++) u[i] = tss__dot_n(r, H + i * r, Y);
     double f = (1 + tss__dot_n(r, u, Y) / sy) / sy;
     for (int i = 0; i < r; i++)
         for (int j = 0; j < r; j++)
             H[i * r + j] += f * S[i] * S[j] - (S[i] * u[j] + u[i] * S[j]) / sy;
-    return s->known = 1;
+    return 1;
 }
 
-// d = −H g, or −g where H is not known. Returns its slope, negative unless there is none.
+// d = −H g. Returns its slope, negative unless there is none.
 static double tss__bfgs_direction(tss_reduced *s) {
     int r = s->r;
-    for (int i = 0; s->known && i < r; i++) s->d[i] = -tss__dot_n(r, s->H + i * r, s->g);
-    double slope = tss__dot_n(r, s->g, s->d);
-    if (s->known && slope < 0) return slope;
-    s->known = 0;
-    for (int i = 0; i < r; i++) s->d[i] = -s->g[i];
-    return -tss__dot_n(r, s->g, s->g);
-}
-
-// ‖φ‖ in the quadratic form of ‖·‖_M, over the size of the body.
-static double tss__bfgs_length(const tss_reduced *s, const double *phi) {
-    double square = 0;
-    for (size_t a = 0; a < s->m; a++)
-        square += phi[a] * tss__n_dot8(s->m, s->G_free + a * s->m, phi);
-    return square > 0 ? sqrt(square) / s->size : 0;
-}
-
-// The t for which t d moves the body by `wanted`, to first order.
-static double tss__bfgs_reach(tss_reduced *s, double wanted) {
-    const double *along = tss__reduced_forward(s, s->z, s->r) + s->m;
-    tss__n_zero(s->gap, s->m);
-    tss__n_combine(s->m, (size_t)s->r, s->d, along, s->gap);
-    double length = tss__bfgs_length(s, s->gap);
-    return length > 0 ? wanted / length : 1;
+    double slope = 0;
+    for (int again = 0; again < 2 && !(slope < 0); again++) {
+        if (!s->known || again) tss__bfgs_begin(s);
+        for (int i = 0; i < r; i++) s->d[i] = -tss__dot_n(r, s->H + i * r, s->g);
+        slope = tss__dot_n(r, s->g, s->d);
+    }
+    return slope;
 }
 
 // φ of z_new = z + t d, and to *move by how much of its size that moves the body.
 static const double *tss__bfgs_go(tss_reduced *s, double t, double *move) {
     for (int i = 0; i < s->r; i++) s->z_new[i] = s->z[i] + t * s->d[i];
     const double *phi = tss__reduced_forward(s, s->z_new, 0);
+    double square = 0;
     for (size_t a = 0; a < s->m; a++) s->gap[a] = phi[a] - s->phi_at[a];
-    *move = tss__bfgs_length(s, s->gap);
+    for (size_t a = 0; a < s->m; a++)
+        square += s->gap[a] * tss__n_dot8(s->m, s->G_free + a * s->m, s->gap);
+    *move = square > 0 ? sqrt(square) / s->size : 0;
     return phi;
 }
 
@@ -4812,19 +4816,17 @@ static void tss__bfgs_mark(tss_reduced *s) {
     memcpy(s->phi_at, tss__reduced_layer(s, s->tape, s->top), s->m * sizeof(double));
 }
 
-// One iteration along d, which would move the body by `move`, φ there in phi. As long as no
-// curvature is known a trial moves it by `reach`, and the first of a step at least by a probe. 1: z
-// is better, or H at least knows more; 0: neither.
+// One iteration along d, which would move the body by `move`, φ there in phi. The first trial of a
+// step is at least as long as a probe. 1: z is better, or H at least knows more; 0: neither.
 static int tss__bfgs_iterate(tss_reduced *s, const double *phi, double slope, double move,
-                             int first, double *reach) {
-    int probe = !s->known || (first && move < TSS__BFGS_PROBE && move > 0);
-    double t = probe ? tss__bfgs_reach(s, s->known ? TSS__BFGS_PROBE : *reach) : 1;
+                             int first) {
+    int probe = first && move < TSS__BFGS_PROBE && move > 0;
+    double t = probe ? TSS__BFGS_PROBE / move : 1;
     for (int k = 0; k < s->def.max_line; k++) {
         if (probe || k) phi = tss__bfgs_go(s, t, &move);
         double E = tss__reduced_energy_there(s, phi, s->g_new, NULL);
         if (tss__reduced_better(s, t, slope, E)) {
             if (move >= TSS__BFGS_ROUNDING) (void)tss__bfgs_learn(s);
-            if (!s->known && *reach < TSS__BFGS_LONGEST) *reach *= 10;
             tss__reduced_take(s, E), tss__bfgs_mark(s);
             return 1;
         }
@@ -4838,7 +4840,7 @@ static int tss__bfgs_iterate(tss_reduced *s, const double *phi, double slope, do
 // stiff as before), so one small move does not end a step: it is made, H learns from it, and if the
 // next is small too that ends the step.
 static tss_exit tss__bfgs_minimise(tss_reduced *s, int *iterations) {
-    double reach = TSS__BFGS_PROBE, move;
+    double move;
     int quiet = 0, again = 1;
     for (*iterations = 0;; ++*iterations) {
         if (tss__n_largest(s->g, s->r) == 0) return TSS_EXIT_CONVERGED;
@@ -4846,13 +4848,13 @@ static tss_exit tss__bfgs_minimise(tss_reduced *s, int *iterations) {
         double slope = tss__bfgs_direction(s);
         if (!(slope < 0)) return TSS_EXIT_LINE_SEARCH;
         const double *phi = tss__bfgs_go(s, 1, &move);
-        int still = s->known && move <= s->def.tol;
+        int still = move <= s->def.tol;
         if (still && quiet) return TSS_EXIT_CONVERGED;
-        if (tss__bfgs_iterate(s, phi, slope, move, *iterations == 0, &reach)) {
+        if (tss__bfgs_iterate(s, phi, slope, move, *iterations == 0)) {
             quiet = still;
         } else if (still) {
             return TSS_EXIT_CONVERGED;
-        } else if (again && s->known) {
+        } else if (again) {  // the exact Hessian once more, here
             again = s->known = 0;
         } else {
             return TSS_EXIT_LINE_SEARCH;
