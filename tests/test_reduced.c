@@ -570,7 +570,23 @@ static void test_bfgs_set(void **state) {
     assert_true(norm(z[0], R) > 0);
     assert_memory_equal(z[0], z[1], sizeof z[0]);
     assert_memory_equal(z[0], z[2], sizeof z[0]);
-    tss_reduced_destroy(sim), tss_net_destroy(n), scene_free(&s), free(force);
+    tss_reduced_destroy(sim);
+    // So many iterations and no more, each lower than the one before.
+    double last = INFINITY;
+    d.tol = 0;
+    for (d.max_iterations = 0; d.max_iterations < 5; d.max_iterations++) {
+        tss_reduced_info info;
+        assert_int_equal(tss_reduced_create(NULL, &d, &sim), TSS_OK);
+        tss_reduced_set_force(sim, force);
+        assert_int_equal(tss_reduced_step(sim, &info), TSS_OK);
+        assert_int_equal(info.exit, TSS_EXIT_ITERATIONS);
+        assert_int_equal(info.iterations, d.max_iterations);
+        assert_int_equal(tss_reduced_exits(sim)[TSS_EXIT_ITERATIONS], 1);
+        assert_true(info.energy < last);
+        last = info.energy;
+        tss_reduced_destroy(sim);
+    }
+    tss_net_destroy(n), scene_free(&s), free(force);
 }
 
 // ---- contact --------------------------------------------------------------------------------
