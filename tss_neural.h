@@ -459,9 +459,10 @@ typedef enum tss_exit {    // the paper's four (§5)
 } tss_exit;
 
 typedef enum tss_reduced_method {
-    // Quasi-Newton with an inverse Hessian that stays from step to step (until tss_reduced_set or
-    // _project, after which the first step takes the exact one), since E's Hessian changes little
-    // between them. Its exit is measured in f, so that the unit of z does not matter. r <= 1024.
+    // Quasi-Newton with an inverse Hessian that stays from step to step, since E's Hessian changes
+    // little between them. It begins with the exact one, and again after tss_reduced_set and
+    // _project, when other nodes become handles, and, if h = 0, when other nodes touch. Its exit is
+    // measured in f, so that the unit of z does not matter. r <= 1024. Masses not all 0.
     TSS_BFGS,
     TSS_LBFGS,  // the paper's: it begins each step anew, with −∇E
     // The exact Hessian of E in z (the curvature of f included; of C without ∇²φ), its negative
@@ -478,7 +479,7 @@ typedef struct tss_reduced_def {
     double h;                      // s; 0: quasi-static. Default 0.05
     tss_reduced_method solver;     // default TSS_BFGS
     // BFGS: a step ends when two directions in a row would move f by no more than tol of the size
-    // of f(start), both in ‖·‖_M (a root mean square). >= 0; default 1e-4.
+    // of f(start), both in ‖·‖_M (a root mean square). >= 0 (below 1e-14: 1e-14); default 1e-4.
     double tol;
     double eps;   // the others: J per unit of z, >= 0; default 1e-5
     double ftol;  // the others: >= 0; default 2.2e-9 (L-BFGS-B's, as the paper's code); 0: never
@@ -3976,9 +3977,11 @@ struct tss_reduced {
     double *tape, *slope, *mid, *bar, *next, *X, *Xbar, *panel, *scratch;
     double *S, *Y, *curve, *part, *g, *g_new, *d, *z_new;  // S, Y: memory × r
     double *H, *V, *lambda;  // r × r twice, r. BFGS: H is the inverse Hessian, if `known`
-    double *phi_at;          // BFGS: φ of the iterate
-    double size;             // of f(start), in ‖·‖_M
-    int known;
+    // BFGS: φ of the iterate; which contact nodes touch at the last evaluation, at the iterate, and
+    // where H began; the size of f(start) in ‖·‖_M; every coordinate that f moves is a handle's.
+    double *phi_at, size;
+    uint64_t touching, touching_at, touching_then;
+    int known, all_held;
     double energy, scale;
     int evaluations, hessians;
     uint64_t exits[TSS_EXITS];
@@ -4009,6 +4012,10 @@ static const char *tss__reduced_complaint(const tss_reduced_def *d) {
     if (d->solver != TSS_LBFGS && d->decoder->inputs > TSS__REDUCED_DENSE)
         return "reduced solver: BFGS and projected Newton take at most 1024 inputs, L-BFGS more";
     if (!(d->shift > 0 && d->shift < 1e300)) return "reduced solver: shift must be > 0";
+    double all = 0;
+    for (int i = 0; d->mass && i < d->decoder->outputs; i++) all += d->mass[i];
+    if (d->solver == TSS_BFGS && d->mass && !(all > 0))
+        return "reduced solver: BFGS measures moves by masses, and all masses are 0";
     return NULL;
 }
 
@@ -4188,6 +4195,12 @@ static void tss__reduced_rank_one(const tss_reduced *s, double f, size_t i, doub
     for (size_t a = 0; f != 0 && a < s->m; a++) tss__n_axpy(s->m, f * b[a], b, G + a * s->m);
 }
 
+static double tss__reduced_trace(const tss_reduced *s, const double *G) {
+    double sum = 0;
+    for (size_t a = 0; a < s->m; a++) sum += G[a * s->m + a];
+    return sum;
+}
+
 static double tss__reduced_at(const tss_reduced *s, size_t i, const double *phi) {
     return s->c[i] + tss__n_dot8(s->m, s->B + i * s->m, phi);
 }
@@ -4238,7 +4251,7 @@ static tss_result tss__reduced_make(const tss_host *host, const tss_reduced_def 
                              "reduced solver: start or f(start) is not finite");
     }
     s->size = sqrt(tss__reduced_size(s, tss_reduced_x(s)));
-    if (!(s->size > 0)) s->size = 1;
+    if (!(s->size > 0 && isfinite(s->size))) s->size = 1;
     *out = s;
     return TSS_OK;
 }
@@ -4326,15 +4339,17 @@ static void tss__reduced_backward(tss_reduced *s, int k, double *g, double *H) {
 }
 
 // C and its derivatives; the Hessian is k a n nᵀ.
-static double tss__reduced_contact(const tss_reduced *s, int k) {
+static double tss__reduced_contact(tss_reduced *s, int k) {
     int d = s->dim;
     double C = 0;
+    s->touching = 0;
     for (int i = 0; i < s->contacts; i++) {
         size_t at = (size_t)s->near[i] * (size_t)d;
         double n[3] = {0}, f = s->def.contact_stiffness * s->near_weight[i];
         double gap = s->def.sdf(s->def.sdf_user, s->X + at, n) - s->def.contact_margin;
         if (isnan(gap)) return gap;
         if (gap >= 0) continue;
+        s->touching = (s->touching ^ (uint64_t)(i + 1)) * 1099511628211u;  // FNV-1a
         C += 0.5 * f * gap * gap;
         for (int a = 0; a < d; a++) s->Xbar[at + (size_t)a] += f * gap * n[a];
         for (int q = 1; q <= k; q++) {
@@ -4495,6 +4510,7 @@ tss_result tss_reduced_set_handles(tss_reduced *s, int count, const int *node, c
     for (int k = 0; same && k < count; k++) same = node[k] == h->node[k];
     if (count) memcpy(h->x, x, (size_t)count * d * sizeof(double));
     if (same) return TSS_OK;
+    s->known = 0;
     for (int k = 0; k < h->count; k++) h->at[h->node[k]] = 0;
     memcpy(s->G_free, s->G, s->m * s->m * sizeof(double));
     for (int k = 0; k < count; k++) {
@@ -4505,6 +4521,7 @@ tss_result tss_reduced_set_handles(tss_reduced *s, int count, const int *node, c
         }
     }
     h->count = count;
+    s->all_held = tss__reduced_trace(s, s->G_free) <= 1e-12 * tss__reduced_trace(s, s->G);
     return TSS_OK;
 }
 
@@ -4743,6 +4760,7 @@ static tss_exit tss__reduced_minimise(tss_reduced *s, int *iterations) {
 // enough to be of the same place; and one that tells nothing.
 #define TSS__BFGS_PROBE 1e-6
 #define TSS__BFGS_ROUNDING 1e-9
+#define TSS__BFGS_LEAST 1e-14  // tol; below it E says nothing
 
 // H begins as the inverse of |∇²E| (its eigenvalues' absolute values, none below 1e-8 of the
 // largest).
@@ -4757,7 +4775,7 @@ static void tss__bfgs_begin(tss_reduced *s) {
         double l = fmax(fabs(s->lambda[a]), most > 0 ? 1e-8 * most : 1);
         for (int i = 0; i < r; i++) tss__n_axpy((size_t)r, v[i] / l, v, s->H + i * r);
     }
-    s->known = 1;
+    s->known = 1, s->touching_then = s->touching_at;
 }
 
 // H from the pair z → z_new (Nocedal and Wright, Eq. 6.17). 0: its curvature is not safely
@@ -4796,7 +4814,7 @@ static const double *tss__bfgs_go(tss_reduced *s, double t, double *move) {
     for (size_t a = 0; a < s->m; a++) s->gap[a] = phi[a] - s->phi_at[a];
     for (size_t a = 0; a < s->m; a++)
         square += s->gap[a] * tss__n_dot8(s->m, s->G_free + a * s->m, s->gap);
-    *move = square > 0 ? sqrt(square) / s->size : 0;
+    *move = isnan(square) ? INFINITY : square > 0 ? sqrt(square) / s->size : 0;
     return phi;
 }
 
@@ -4811,54 +4829,76 @@ static double tss__bfgs_shorter(double t, double E0, double slope0, double E, do
     return best > 0.1 * t ? (best < 0.8 * t ? best : 0.8 * t) : 0.1 * t;
 }
 
-// φ of the last evaluation is that of the iterate.
+// The last evaluation was at what is the iterate now.
 static void tss__bfgs_mark(tss_reduced *s) {
+    s->touching_at = s->touching;
     memcpy(s->phi_at, tss__reduced_layer(s, s->tape, s->top), s->m * sizeof(double));
 }
 
-// One iteration along d, which would move the body by `move`, φ there in phi. The first trial of a
-// step is at least as long as a probe. 1: z is better, or H at least knows more; 0: neither.
+// H learns the curvature along d, which would move the body by `move`, from a longer move that is
+// not made. 0: it is not positive.
+static int tss__bfgs_measure(tss_reduced *s, double move) {
+    const double *phi = tss__bfgs_go(s, TSS__BFGS_PROBE / move, &move);
+    double E = tss__reduced_energy_there(s, phi, s->g_new, NULL);
+    return isfinite(E) && tss__bfgs_learn(s);
+}
+
+// One iteration along d, which would move the body by `move`, φ there in phi. 0: no trial is
+// better. *taught: whether H learned from it.
 static int tss__bfgs_iterate(tss_reduced *s, const double *phi, double slope, double move,
-                             int first) {
-    int probe = first && move < TSS__BFGS_PROBE && move > 0;
-    double t = probe ? TSS__BFGS_PROBE / move : 1;
+                             int *taught) {
+    double t = 1;
     for (int k = 0; k < s->def.max_line; k++) {
-        if (probe || k) phi = tss__bfgs_go(s, t, &move);
+        if (k) phi = tss__bfgs_go(s, t, &move);
         double E = tss__reduced_energy_there(s, phi, s->g_new, NULL);
         if (tss__reduced_better(s, t, slope, E)) {
-            if (move >= TSS__BFGS_ROUNDING) (void)tss__bfgs_learn(s);
+            *taught = move < TSS__BFGS_ROUNDING || tss__bfgs_learn(s);
             tss__reduced_take(s, E), tss__bfgs_mark(s);
             return 1;
         }
-        if (probe && k == 0 && isfinite(E) && tss__bfgs_learn(s)) return 1;
         t = tss__bfgs_shorter(t, s->energy, slope, E, tss__dot_n(s->r, s->g_new, s->d));
     }
     return 0;
 }
 
-// What H says of a place where it has not been can be wrong (where a contact has opened it is as
-// stiff as before), so one small move does not end a step: it is made, H learns from it, and if the
-// next is small too that ends the step.
+// H may not know the place where it is: where a contact has opened it is as stiff as before, and
+// all directions look small. So one small move does not end a step: it is made, H learns from it
+// (or from a longer one that is only tried), and if the next is small too that ends the step. The
+// exact Hessian has to say so too if H began in this step, and where no inertia bounds what is
+// missed (h = 0) if other nodes touch than where it began. It also takes H's place, once, where H
+// cannot learn or no trial is better.
 static tss_exit tss__bfgs_minimise(tss_reduced *s, int *iterations) {
-    double move;
-    int quiet = 0, again = 1;
-    for (*iterations = 0;; ++*iterations) {
+    double move, tol = fmax(s->def.tol, TSS__BFGS_LEAST);
+    int quiet = 0, measured = 0, again = 1, began = !s->known;
+    *iterations = 0;
+    if (s->all_held) return TSS_EXIT_CONVERGED;
+    for (;;) {
         if (tss__n_largest(s->g, s->r) == 0) return TSS_EXIT_CONVERGED;
-        if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
         double slope = tss__bfgs_direction(s);
         if (!(slope < 0)) return TSS_EXIT_LINE_SEARCH;
         const double *phi = tss__bfgs_go(s, 1, &move);
-        int still = move <= s->def.tol;
-        if (still && quiet) return TSS_EXIT_CONVERGED;
-        if (tss__bfgs_iterate(s, phi, slope, move, *iterations == 0)) {
-            quiet = still;
-        } else if (still) {
-            return TSS_EXIT_CONVERGED;
-        } else if (again) {  // the exact Hessian once more, here
-            again = s->known = 0;
-        } else {
-            return TSS_EXIT_LINE_SEARCH;
+        int still = move <= tol, taught = 1;
+        if (still && quiet) {
+            int other = s->def.h == 0 && s->touching_at != s->touching_then;
+            if (!began && !other) return TSS_EXIT_CONVERGED;
+            began = s->known = 0;
+            continue;
         }
+        if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
+        if (still && !measured && move > 0 && move < TSS__BFGS_PROBE) {
+            measured = 1;
+            if (tss__bfgs_measure(s, move)) continue;
+            taught = 0;
+        } else if (tss__bfgs_iterate(s, phi, slope, move, &taught)) {
+            quiet = still, measured = still;
+            ++*iterations;
+        } else if (!again) {
+            return still ? TSS_EXIT_CONVERGED : TSS_EXIT_LINE_SEARCH;
+        } else {
+            taught = still = 0;
+            again = s->known = 0;
+        }
+        if (still && !taught && again) again = s->known = quiet = 0;
     }
 }
 
@@ -4885,7 +4925,7 @@ tss_result tss_reduced_step(tss_reduced *s, tss_reduced_info *out) {
     s->energy = tss__reduced_energy(s, s->z, s->g, NULL);
     tss__bfgs_mark(s);
     double E = tss__reduced_energy(s, s->z_new, s->g_new, NULL);
-    if (E < s->energy) tss__reduced_take(s, E), tss__bfgs_mark(s);
+    if (isfinite(E) && !(E >= s->energy)) tss__reduced_take(s, E), tss__bfgs_mark(s);
     tss_reduced_info info = tss__reduced_solve(s);
     tss__reduced_advance(s);
     s->exits[info.exit]++;
