@@ -511,8 +511,8 @@ typedef struct tss_reduced_info {
 
 typedef struct tss_reduced tss_reduced;  // opaque; one thread at a time, tss_reduced_x included
 // Memory: 2 copies of the last layer (coordinates × width), the second only of the rows that
-// elements and contact touch. Errors: BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then
-// NULL.
+// elements and contact touch; but for L-BFGS 2 r numbers more for each of these rows. Errors:
+// BAD_ARGUMENT (the log says what), NO_MEMORY; *out is then NULL.
 TSS_API tss_result tss_reduced_create(const tss_host *host, const tss_reduced_def *def,
                                       tss_reduced **out);
 TSS_API void tss_reduced_destroy(tss_reduced *s);  // NULL allowed
@@ -3999,9 +3999,12 @@ tss_reduced_def tss_reduced_def_default(void) {
 static const char *tss__reduced_complaint(const tss_reduced_def *d) {
     if (!(d->h >= 0 && d->h < 1e300)) return "reduced solver: h must be >= 0";
     if (d->h > 0 && !d->mass) return "reduced solver: dynamics need masses";
-    for (int i = 0; d->mass && i < d->decoder->outputs; i++)
+    double all = 0;
+    for (int i = 0; d->mass && i < d->decoder->outputs; i++) {
         if (!(d->mass[i] >= 0 && d->mass[i] < 1e300))
             return "reduced solver: a mass is negative or not finite";
+        all += d->mass[i];
+    }
     if (!(d->tol >= 0) || !(d->eps >= 0) || !(d->ftol >= 0))
         return "reduced solver: a tolerance is negative";
     if (d->memory < 1 || d->memory > 64 || d->max_line < 1 || d->max_iterations < 0)
@@ -4012,8 +4015,6 @@ static const char *tss__reduced_complaint(const tss_reduced_def *d) {
     if (d->solver != TSS_LBFGS && d->decoder->inputs > TSS__REDUCED_DENSE)
         return "reduced solver: BFGS and projected Newton take at most 1024 inputs, L-BFGS more";
     if (!(d->shift > 0 && d->shift < 1e300)) return "reduced solver: shift must be > 0";
-    double all = 0;
-    for (int i = 0; d->mass && i < d->decoder->outputs; i++) all += d->mass[i];
     if (d->solver == TSS_BFGS && d->mass && !(all > 0))
         return "reduced solver: BFGS measures moves by masses, and all masses are 0";
     return NULL;
@@ -4877,7 +4878,7 @@ static tss_exit tss__bfgs_minimise(tss_reduced *s, int *iterations) {
         double slope = tss__bfgs_direction(s);
         if (!(slope < 0)) return TSS_EXIT_LINE_SEARCH;
         const double *phi = tss__bfgs_go(s, 1, &move);
-        int still = move <= tol, taught = 1;
+        int still = move <= tol, taught, lost = 0;
         if (still && quiet) {
             int other = s->def.h == 0 && s->touching_at != s->touching_then;
             if (!began && !other) return TSS_EXIT_CONVERGED;
@@ -4886,19 +4887,16 @@ static tss_exit tss__bfgs_minimise(tss_reduced *s, int *iterations) {
         }
         if (*iterations == s->def.max_iterations) return TSS_EXIT_ITERATIONS;
         if (still && !measured && move > 0 && move < TSS__BFGS_PROBE) {
-            measured = 1;
-            if (tss__bfgs_measure(s, move)) continue;
-            taught = 0;
+            measured = 1, lost = !tss__bfgs_measure(s, move);
         } else if (tss__bfgs_iterate(s, phi, slope, move, &taught)) {
-            quiet = still, measured = still;
+            quiet = measured = still, lost = still && !taught;
             ++*iterations;
-        } else if (!again) {
-            return still ? TSS_EXIT_CONVERGED : TSS_EXIT_LINE_SEARCH;
+        } else if (again) {
+            lost = 1;
         } else {
-            taught = still = 0;
-            again = s->known = 0;
+            return still ? TSS_EXIT_CONVERGED : TSS_EXIT_LINE_SEARCH;
         }
-        if (still && !taught && again) again = s->known = quiet = 0;
+        if (lost && again) again = s->known = quiet = 0;
     }
 }
 

@@ -30,6 +30,8 @@ static void mesh(void) {
             }
 }
 
+static const char *const names[] = {"BFGS", "L-BFGS", "projected Newton"};
+
 static void run(const tss_net *net, const tss_elements *e, tss_reduced_method method,
                 const char *name) {
     tss_reduced_def d = tss_reduced_def_default();
@@ -49,11 +51,8 @@ static void run(const tss_net *net, const tss_elements *e, tss_reduced_method me
         t = cpu_ms(), (void)tss_reduced_x(s), decoding += cpu_ms() - t;
         iterations += info.iterations, evaluations += info.evaluations;
     }
-    printf("%s,%s,%d,%.2f,%.2f,%.3f,%.3f,%.3f,%.1f\n", name,
-           method == TSS_LBFGS  ? "L-BFGS"
-           : method == TSS_BFGS ? "BFGS"
-                                : "projected Newton",
-           steps, 1.0 * iterations / steps, 1.0 * evaluations / steps, stepping / steps,
+    printf("%s,%s,%d,%.2f,%.2f,%.3f,%.3f,%.3f,%.1f\n", name, names[method], steps,
+           1.0 * iterations / steps, 1.0 * evaluations / steps, stepping / steps,
            stepping / iterations, decoding / steps, created);
     tss_reduced_destroy(s);
 }

@@ -50,7 +50,8 @@ left() {
     awk -v s=$seconds 'BEGIN {print s / 60}'
 }
 
-# there FILE COLUMN=VALUE...: a row of OUT/FILE has all of these; numbers are compared as numbers.
+# there FILE COLUMN=VALUE...: a row of OUT/FILE has all of these; numbers are compared as numbers. A VALUE that
+# names a column is what that has.
 there() {
     [ -s "$out/$1" ] || return 1
     file=$out/$1; shift
@@ -59,10 +60,13 @@ there() {
         /^#/ {next}
         /^system,/ {for (i = 1; i <= NF; i++) at[$i] = i; next}
         {ok = 1
-         for (k = 1; k <= n; k++) {split(w[k], p, "="); ok = ok && $(at[p[1]]) == p[2]}
+         for (k = 1; k <= n; k++) {split(w[k], p, "="); ok = ok && $(at[p[1]]) == (p[2] in at ? $(at[p[2]]) : p[2])}
          if (ok) {found = 1; exit}}
         END {exit !found}' "$file"
 }
+
+# cells_of C: what a row with solver.cubature C has as runtime_cells
+cells_of() { [ "$1" = 0 ] && echo elements || echo "$1"; }
 
 # value FILE METHOD COLUMN
 value() { awk -F, -v m="$2" -v c="$3" '/^system,/ {for (i = 1; i <= NF; i++) if ($i == c) k = i} $2 == m {print $k}' "$1"; }
@@ -139,8 +143,7 @@ newton() {
 
 bfgs() {
     for c in ${cells:-0}; do
-        [ "$c" = 0 ] && there neural_bfgs.csv system="$1" seed="$2" && continue
-        there neural_bfgs.csv system="$1" seed="$2" runtime_cells="$c" && continue
+        there neural_bfgs.csv system="$1" seed="$2" runtime_cells="$(cells_of "$c")" && continue
         train "$1" "$2" && rows evaluate neural_bfgs.csv "$1" "$work/$1" "$2" --set neural.solver.kind=bfgs --set "neural.solver.cubature=$c"
     done
 }
@@ -178,8 +181,7 @@ runtime() {
     trained=$(awk 'match($0, /"cubature": [0-9]+/) {print substr($0, RSTART + 12, RLENGTH - 12)}' "examples/scenes/neural_$1.json")
     for c in ${cells:-0 "$trained"}; do
         train "$1" "$2" || return
-        [ "$c" = 0 ] && there neural_runtime.csv system="$1" seed="$2" && continue
-        there neural_runtime.csv system="$1" seed="$2" runtime_cells="$c" && continue
+        there neural_runtime.csv system="$1" seed="$2" runtime_cells="$(cells_of "$c")" && continue
         rows evaluate neural_runtime.csv "$1" "$work/$1" "$2" --set "neural.solver.cubature=$c"
     done
 }
